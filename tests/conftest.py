@@ -43,7 +43,7 @@ def tol() -> Callable[..., dict[str, float]]:
 
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shape checks off: for errors as a user sees them, and for `torch.compile`, which can't trace."""
+    """Shape checks off: for errors as users see them, and for `torch.compile`."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 

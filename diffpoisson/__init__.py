@@ -1,0 +1,56 @@
+"""Differentiable geometry processing: Jacobians, Poisson solves, distortion on triangle meshes."""
+
+from __future__ import annotations
+
+from diffpoisson.distortion import (
+    arap,
+    area_distortion,
+    determinant,
+    flipped,
+    isometric_amips,
+    isometric_distortion,
+    lscm,
+    mips,
+    singular_values,
+    symmetric_dirichlet,
+)
+from diffpoisson.gradient import divergence, jacobians, laplacian
+from diffpoisson.mesh import CleanedMesh, Mesh, MeshError
+from diffpoisson.poisson import PoissonSolver, solve_poisson
+from diffpoisson.restriction import extend, restrict
+from diffpoisson.sampling import SurfaceSamples, sample_surface
+from diffpoisson.spectral import (
+    heat_kernel_signature,
+    laplacian_eigenpairs,
+    lumped_mass,
+    wave_kernel_signature,
+)
+
+__all__ = [
+    "CleanedMesh",
+    "Mesh",
+    "MeshError",
+    "PoissonSolver",
+    "SurfaceSamples",
+    "arap",
+    "area_distortion",
+    "determinant",
+    "divergence",
+    "extend",
+    "flipped",
+    "heat_kernel_signature",
+    "isometric_amips",
+    "isometric_distortion",
+    "jacobians",
+    "laplacian",
+    "laplacian_eigenpairs",
+    "lscm",
+    "lumped_mass",
+    "mips",
+    "restrict",
+    "sample_surface",
+    "singular_values",
+    "solve_poisson",
+    "symmetric_dirichlet",
+    "wave_kernel_signature",
+]

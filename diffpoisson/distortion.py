@@ -1,0 +1,172 @@
+"""Distortion of a map, from the closed-form singular values of its Jacobians.
+
+All functions take J of shape (…, c, 2), c = 2 for maps to the plane and c = 3 for maps to space,
+and return one density per face, (…); weigh by `mesh.areas` to integrate. Nothing here calls an SVD,
+whose gradients are not finite at repeated singular values (every isometry).
+
+A map to the plane has *signed* singular values σ₁ ≥ |σ₂| with sign(σ₂) = sign(det J): a negative σ₂
+is a flipped face. Energies that punish collapse (symmetric Dirichlet, MIPS, AMIPS, area) are
+infinite, with zero gradient, where det J ≤ 0. To optimise through flips, their ε > 0 replaces det J
+in denominators by
+
+    χ(det J) = (det J + √(ε² + det² J)) / 2 > 0            (Garanzha et al. 2021, eq. 4)
+
+which tends to det J for det J ≫ ε and keeps pushing a flipped face towards det J > 0.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Jacobian = Float[Tensor, "*batch c 2"]
+Density = Float[Tensor, "*batch"]
+
+
+def singular_values(J: Jacobian) -> Float[Tensor, "*batch 2"]:
+    """Signed singular values (σ₁, σ₂): σ₁ ≥ |σ₂|, and sign(σ₂) = sign(det J) for maps to the plane.
+
+    Gradients are finite everywhere; at a repeated value, where none exists, they are the
+    subgradient that treats both directions alike.
+
+    Raises:
+        ValueError: J is not (…, 2, 2) or (…, 3, 2).
+    """
+    total, difference = _sum_and_difference(J)
+    return torch.stack([total + difference, total - difference], dim=-1) / 2
+
+
+def determinant(J: Jacobian) -> Density:
+    """det J = σ₁σ₂, the area ratio: signed for maps to the plane, positive for maps to space."""
+    _check(J)
+    u, v = J.unbind(-1)
+    if J.shape[-2] == 2:
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return torch.linalg.vector_norm(torch.linalg.cross(u, v), dim=-1)
+
+
+def flipped(J: Jacobian) -> Bool[Tensor, "*batch"]:
+    """Whether each face is flipped or collapsed, det J ≤ 0 (the paper's #I counts them)."""
+    return determinant(J) <= 0
+
+
+def isometric_distortion(J: Jacobian) -> Density:
+    """D = max(σ₁, 1/σ₂), 1 at an isometry, +∞ at a flip (the paper counts D > 10)."""
+    largest, smallest = singular_values(J).unbind(-1)
+    return torch.where(smallest > 0, torch.maximum(largest, smallest.reciprocal()), torch.inf)
+
+
+def symmetric_dirichlet(J: Jacobian, epsilon: float = 0.0) -> Density:
+    """‖J‖² + ‖J⁻¹‖² = Σ σᵢ² + σᵢ⁻², 4 at an isometry (Smith and Schaefer 2015).
+
+    Regularised: ‖J‖² (1 + 1/χ²).
+    """
+    chi = _positive_determinant(J, epsilon)
+    return _guard(_squared_norm(J) * (1 + chi**-2), chi)
+
+
+def arap(J: Jacobian) -> Density:
+    """As-rigid-as-possible, Σ (σᵢ - 1)² = min over rotations Q of ‖J - Q‖² (Liu et al. 2008)."""
+    return _squared_norm(J) - 2 * _sum_and_difference(J)[0] + 2
+
+
+def lscm(J: Jacobian) -> Density:
+    """Conformal energy, (σ₁ - σ₂)² / 2, 0 at an unflipped similarity (Lévy et al. 2002)."""
+    _check(J)
+    if J.shape[-2] == 2:
+        return _similarity_parts(J)[1].square().sum(-1) / 2
+    return _sum_and_difference(J)[1].square() / 2
+
+
+def mips(J: Jacobian, epsilon: float = 0.0) -> Density:
+    """MIPS, σ₁/σ₂ + σ₂/σ₁, 2 at a similarity (Hormann and Greiner 2000)."""
+    chi = _positive_determinant(J, epsilon)
+    return _guard(_squared_norm(J) / chi, chi)
+
+
+def area_distortion(J: Jacobian, epsilon: float = 0.0) -> Density:
+    """det J + 1 / det J, 2 where the map keeps areas.
+
+    Regularised: (det² J + 1) / χ, which stays positive at flips (Garanzha et al. 2021, eq. 5).
+    """
+    chi = _positive_determinant(J, epsilon)
+    return _guard((determinant(J) ** 2 + 1) / chi, chi)
+
+
+def isometric_amips(
+    J: Jacobian, epsilon: float = 0.0, *, exponent: float = 5.0, conformal: float = 0.5
+) -> Density:
+    """Isometric advanced MIPS, exp(s (α mips + (1 - α) area) / 2) (Fu et al. 2015, eq. 9).
+
+    Args:
+        J: (…, c, 2) Jacobians.
+        epsilon: regularisation, see the module's text.
+        exponent: s; the larger, the more the worst face counts. exp(s) at an isometry.
+        conformal: α, the weight of angles against areas.
+    """
+    mean = conformal * mips(J, epsilon) + (1 - conformal) * area_distortion(J, epsilon)
+    return torch.exp(exponent / 2 * mean)
+
+
+# -------------------------------------------------------------------- closed forms
+
+
+def _check(J: Tensor) -> None:
+    if J.ndim < 2 or J.shape[-1] != 2 or J.shape[-2] not in (2, 3):
+        raise ValueError(
+            f"distortion: expected J of shape (…, 2, 2) or (…, 3, 2), got {tuple(J.shape)}"
+        )
+
+
+def _squared_norm(J: Tensor) -> Tensor:
+    return J.square().sum(dim=(-2, -1))
+
+
+def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
+    """σ₁ + σ₂ and σ₁ - σ₂, each without cancellation; subgradient zero where a norm vanishes."""
+    _check(J)
+    if J.shape[-2] == 3:
+        return _spatial_sum_and_difference(J)
+    similarity, anti_similarity = _similarity_parts(J)
+    norm = torch.linalg.vector_norm
+    return norm(similarity, dim=-1), norm(anti_similarity, dim=-1)
+
+
+def _similarity_parts(J: Tensor) -> tuple[Tensor, Tensor]:
+    """J = similarity + anti-similarity, as vectors of length σ₁ + σ₂ and σ₁ - σ₂."""
+    a, b, c, d = J.flatten(-2).unbind(-1)
+    return torch.stack([a + d, c - b], dim=-1), torch.stack([a - d, c + b], dim=-1)
+
+
+def _spatial_sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
+    """First fundamental form: (σ₁ + σ₂)² = ‖J‖² + 2 det J, σ₁² - σ₂² = |(E - G, 2F)|."""
+    u, v = J.unbind(-1)
+    E, F, G = (u * u).sum(-1), (u * v).sum(-1), (v * v).sum(-1)
+    total = _sqrt(E + G + 2 * determinant(J))
+    spread = torch.linalg.vector_norm(torch.stack([E - G, 2 * F], dim=-1), dim=-1)
+    # A zero total means J = 0, where the difference is zero too.
+    return total, torch.where(total > 0, spread / torch.where(total > 0, total, 1), 0)
+
+
+def _sqrt(x: Tensor) -> Tensor:
+    """√x with subgradient zero at zero."""
+    return torch.where(x > 0, torch.where(x > 0, x, 1).sqrt(), 0)
+
+
+def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:
+    """det J itself for ε = 0, else χ(det J)."""
+    if epsilon < 0:
+        raise ValueError(f"distortion: epsilon must not be negative, got {epsilon}")
+    det = determinant(J)
+    if epsilon == 0:
+        return det
+    root = (det.square() + epsilon**2).sqrt()
+    # For det < 0 the sum cancels; multiply by its conjugate instead.
+    inverted = det < 0
+    return torch.where(inverted, epsilon**2 / torch.where(inverted, root - det, 1), root + det) / 2
+
+
+def _guard(energy: Tensor, chi: Tensor) -> Tensor:
+    """+∞ with zero gradient where the determinant is not positive."""
+    return torch.where(chi > 0, energy, torch.inf)

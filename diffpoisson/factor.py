@@ -1,0 +1,99 @@
+"""Cached sparse Cholesky factors: the only file that knows cholespy, and closes its traps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cholespy
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffpoisson.linear_map import Matrix
+
+_MAX_CUDA_COLUMNS = 128  # cholespy's limit for one call on a GPU
+
+
+class CholeskyFactor(Matrix):
+    """A⁻¹ of a symmetric positive definite matrix A, through its sparse factorisation A = L Lᵀ.
+
+    Factorised once, in float64, on the CPU (CHOLMOD, nested dissection); solves run on `device`.
+    Pickling and copying carry the matrix and factorise again.
+
+    Args:
+        matrix: (n, n) sparse, symmetric positive definite; only real, finite entries.
+        device: where right-hand sides will live.
+
+    Raises:
+        ValueError: not square, not finite, or not positive definite.
+    """
+
+    def __init__(self, matrix: sp.spmatrix, device: torch.device | str = "cpu") -> None:
+        rows, cols = matrix.shape
+        if rows != cols:
+            raise ValueError(f"CholeskyFactor: expected a square matrix, got shape {matrix.shape}")
+        # cholespy accepts NaN silently, and with its CSC input it edits the caller's memory: give
+        # it COO.
+        coo = matrix.tocsr().tocoo()  # sums duplicate entries
+        if not np.isfinite(coo.data).all():
+            raise ValueError("CholeskyFactor: the matrix has entries that are not finite")
+        self.shape = (rows, cols)
+        self._recipe = (matrix, device)
+        self._device = torch.device(device)
+        arrays = (coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data.astype(np.float64))
+        try:
+            self._solver = cholespy.CholeskySolverD(
+                rows, *(torch.from_numpy(a).to(device) for a in arrays), cholespy.MatrixType.COO
+            )
+        except ValueError as error:
+            raise ValueError(
+                f"CholeskyFactor: the matrix is not positive definite: {error}"
+            ) from error
+
+    def multiply(self, x: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """A⁻¹ x by forward and back substitution, in float64 inside."""
+        # cholespy checks no row count (it would read past the end) and rejects views: both end
+        # here.
+        if x.ndim != 2 or len(x) != self.shape[0]:
+            raise ValueError(
+                f"CholeskyFactor: expected x of shape ({self.shape[0]}, k), got {tuple(x.shape)}"
+            )
+        if x.device != self._device:
+            raise ValueError(f"CholeskyFactor: x is on {x.device}, the factor on {self._device}")
+        width = _MAX_CUDA_COLUMNS if x.is_cuda else max(x.shape[1], 1)
+        return torch.cat([self._solve(chunk) for chunk in x.split(width, dim=1)], dim=1).to(x.dtype)
+
+    def _solve(self, b: Tensor) -> Tensor:
+        b = b.detach().double().contiguous()
+        x = torch.empty_like(b)
+        if b.shape[1]:
+            self._solver.solve(b, x)
+        return x
+
+    def transposed(self) -> CholeskyFactor:
+        """Itself: A is symmetric."""
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return CholeskyFactor, self._recipe
+
+
+class BlockDiagonal(Matrix):
+    """A block-diagonal matrix, multiplied block by block: factors of several meshes as one."""
+
+    def __init__(self, blocks: Sequence[Matrix]) -> None:
+        self._blocks = blocks
+        self._columns = [block.shape[1] for block in blocks]
+        self.shape = (sum(block.shape[0] for block in blocks), sum(self._columns))
+
+    def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
+        """A x."""
+        pieces = x.split(self._columns)
+        return torch.cat([A.multiply(piece) for A, piece in zip(self._blocks, pieces, strict=True)])
+
+    def transposed(self) -> BlockDiagonal:
+        """Aᵀ."""
+        return BlockDiagonal([block.transposed() for block in self._blocks])

@@ -1,0 +1,227 @@
+"""The gradient ∇ of piecewise-linear maps, its adjoint ∇ᵀA, and the cotangent Laplacian L = ∇ᵀA∇.
+
+∇ maps vertex values to one tangent vector per face (paper, eq. 2: Jᵢ = Φ∇ᵢᵀ). Its entries are the
+gradients of the hat functions λ: rotating the edge eᵢ opposite to corner i by 90° gives ∇λᵢ = eᵢ^⊥
+/ 2|t|.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import cached_property
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffpoisson.linear_map import LinearMap, Matrix
+from diffpoisson.mesh import Mesh
+from diffpoisson.restriction import extend, restrict
+
+
+class SparseMatrix(Matrix):
+    """A constant CSR matrix, multiplied in the dtype of the operand."""
+
+    def __init__(self, matrix: sp.csr_matrix, device: torch.device) -> None:
+        self.shape = matrix.shape
+        self._scipy = matrix
+        self._device = device
+        self._by_dtype: dict[torch.dtype, Tensor] = {}
+
+    def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
+        """A x."""
+        return self._in(x.dtype) @ x
+
+    def transposed(self) -> SparseMatrix:
+        """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""
+        return SparseMatrix(self._scipy.T.tocsr(), self._device)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SparseMatrix, (self._scipy, self._device)
+
+    def _in(self, dtype: torch.dtype) -> Tensor:
+        if dtype not in (torch.float32, torch.float64):
+            raise TypeError(
+                f"mesh operators work in float32 and float64, got {dtype}; convert first"
+            )
+        if dtype not in self._by_dtype:
+            self._by_dtype[dtype] = _to_torch(self._scipy, dtype, self._device)
+        return self._by_dtype[dtype]
+
+
+def _to_torch(matrix: sp.csr_matrix, dtype: torch.dtype, device: torch.device) -> Tensor:
+    arrays = (matrix.indptr, matrix.indices, matrix.data)
+    crow, col, values = (torch.from_numpy(np.ascontiguousarray(a)) for a in arrays)
+    with warnings.catch_warnings():
+        # torch says once per process that its CSR layout is in beta; users of a mesh can't act on
+        # it.
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(
+            crow.int(),  # MKL's kernels take 32-bit indices as they are
+            col.int(),
+            values.to(dtype),
+            matrix.shape,
+            device=device,
+            check_invariants=False,  # SciPy built it
+        )
+
+
+class GradientOperator:
+    """∇ and ∇ᵀA of one mesh as sparse matrices, assembled once; see `gradient_operator`."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.n_vertices, self.n_faces, self._device = mesh.n_vertices, mesh.n_faces, mesh.device
+        self.matrix = _gradient_matrix(mesh)
+        self._areas = mesh._double_areas.cpu().numpy()
+
+    @cached_property
+    def gradient(self) -> LinearMap:
+        """∇: (n, k) vertex values to (2m, k); row 2j + d is tangent direction d on face j."""
+        return LinearMap(SparseMatrix(self.matrix, self._device))
+
+    @cached_property
+    def divergence(self) -> LinearMap:
+        """∇ᵀA: (2m, k) to (n, k)."""
+        return LinearMap(SparseMatrix(self.divergence_matrix, self._device))
+
+    @cached_property
+    def divergence_matrix(self) -> sp.csr_matrix:
+        """∇ᵀA as a SciPy matrix (n, 2m)."""
+        return (sp.diags(self._areas.repeat(2)) @ self.matrix).T.tocsr()
+
+    @cached_property
+    def laplacian(self) -> sp.csr_matrix:
+        """L = ∇ᵀA∇ as a SciPy matrix (n, n)."""
+        return (self.divergence_matrix @ self.matrix).tocsr()
+
+
+_operators: WeakKeyDictionary[Mesh, GradientOperator] = WeakKeyDictionary()
+
+
+def gradient_operator(mesh: Mesh) -> GradientOperator:
+    """The mesh's operators, assembled at the first call and kept as long as the mesh lives."""
+    if mesh not in _operators:
+        _operators[mesh] = GradientOperator(mesh)
+    return _operators[mesh]
+
+
+def jacobians(
+    mesh: Mesh, phi: Float[Tensor, "*batch n c"], *, extrinsic: bool = False
+) -> Float[Tensor, "*batch m c d"]:
+    """Jacobian of a piecewise-linear map on each face (paper, eq. 2).
+
+    Args:
+        mesh: the domain.
+        phi: (…, n, c) float32 or float64 image of each vertex, c output coordinates.
+        extrinsic: return J Bᵀ, acting on ambient vectors (zero along the normal), instead of J.
+
+    Returns:
+        (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) if extrinsic; row = output
+        coordinate, column = tangent direction. Dimensionless if the image has the mesh's units.
+
+    Raises:
+        ValueError: phi does not have one row per vertex.
+    """
+    if phi.ndim < 2 or phi.shape[-2] != mesh.n_vertices:
+        raise ValueError(
+            f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
+        )
+    J = columns_to_matrices(gradient_operator(mesh).gradient(vertices_to_columns(phi)), phi.shape)
+    return extend(J, mesh.frames) if extrinsic else J
+
+
+def divergence(mesh: Mesh, R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "*batch n c"]:
+    """∇ᵀA R, the adjoint of the gradient in the area-weighted inner product.
+
+    This is the integrated divergence with the sign of an adjoint: ⟨∇ᵀA R, Φ⟩ = Σ |tⱼ| ⟨Rⱼ, (∇Φ)ⱼ⟩.
+
+    Args:
+        mesh: the domain.
+        R: (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) on ambient vectors.
+
+    Raises:
+        ValueError: R does not have one such matrix per face.
+    """
+    R = as_intrinsic("divergence", mesh, R)
+    return columns_to_vertices(gradient_operator(mesh).divergence(matrices_to_columns(R)), R.shape)
+
+
+def laplacian(mesh: Mesh) -> sp.csr_matrix:
+    """The cotangent Laplacian L = ∇ᵀA∇, (n, n), symmetric positive semi-definite, float64."""
+    return gradient_operator(mesh).laplacian.copy()
+
+
+def as_intrinsic(
+    operation: str, mesh: Mesh, R: Float[Tensor, "*batch m c k"]
+) -> Float[Tensor, "*batch m c d"]:
+    """R in frame coordinates, restricted if it acts on ambient vectors; any other shape raises."""
+    D, d = mesh.dim, 2
+    if R.ndim < 3 or R.shape[-3] != mesh.n_faces or R.shape[-1] not in (d, D):
+        sizes = " or ".join(str(size) for size in sorted({d, D}))
+        raise ValueError(
+            f"{operation}: expected one matrix per face, (…, m={mesh.n_faces}, c, {sizes}), "
+            f"got {tuple(R.shape)}"
+        )
+    return R if R.shape[-1] == d else restrict(R, mesh.frames)
+
+
+# ------------------------------------------------------- fields as columns, for sparse products
+
+
+def vertices_to_columns(phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "n k"]:
+    """Batch and output coordinates side by side: (…, n, c) to (n, …·c)."""
+    return phi.movedim(-2, 0).flatten(1)
+
+
+def columns_to_vertices(
+    columns: Float[Tensor, "n k"], shape: torch.Size
+) -> Float[Tensor, "*batch n c"]:
+    """Back to (…, n, c), given the shape (…, m, c, d) of the matrices the columns came from."""
+    return columns.unflatten(1, (*shape[:-3], shape[-2])).movedim(0, -2)
+
+
+def matrices_to_columns(R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "rows k"]:
+    """(…, m, c, d) to (m·d, …·c), row d·j + i is direction i on face j."""
+    m, d = R.shape[-3], R.shape[-1]
+    return R.movedim((-3, -1), (0, 1)).reshape(m * d, math.prod(R.shape[:-3]) * R.shape[-2])
+
+
+def columns_to_matrices(
+    columns: Float[Tensor, "rows k"], shape: torch.Size
+) -> Float[Tensor, "*batch m c d"]:
+    """(2m, …·c) back to (…, m, c, 2), given the shape (…, n, c) of the map it came from."""
+    return (
+        columns.unflatten(1, (*shape[:-2], shape[-1]))
+        .unflatten(0, (-1, 2))
+        .movedim((0, 1), (-3, -1))
+    )
+
+
+# ------------------------------------------------------- assembly
+
+
+def _gradient_matrix(mesh: Mesh) -> sp.csr_matrix:
+    """∇ as (2m, n): row 2j + d holds component d of the three hat gradients of face j."""
+    m = mesh.n_faces
+    values = _hat_gradients(mesh).cpu().numpy()  # (m, 2, 3)
+    columns = mesh.faces.cpu().numpy().repeat(2, axis=0)
+    rows = np.arange(0, 6 * m + 1, 3)
+    matrix = sp.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(2 * m, mesh.n_vertices))
+    matrix.sort_indices()
+    return matrix
+
+
+def _hat_gradients(mesh: Mesh) -> Float[Tensor, "m 2 3"]:
+    """∇λᵢ = eᵢ^⊥ / 2|t| in frame coordinates, float64; column i belongs to corner i."""
+    corners = mesh.vertices.double()[mesh.faces]
+    opposite = corners.roll(1, dims=1) - corners.roll(-1, dims=1)  # e₀ = v₂ - v₁, …
+    x, y = (opposite @ mesh._double_frames).unbind(2)
+    doubled_area = 2 * mesh._double_areas
+    if mesh.dim == 2:  # clockwise faces: the rotation by 90° turns the other way
+        doubled_area = mesh._doubled_area_vectors
+    return torch.stack([-y, x], dim=1) / doubled_area[:, None, None]

@@ -1,0 +1,515 @@
+"""The triangle mesh on which every operator of this package is defined, validated once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csgraph
+from torch import Tensor
+
+ArrayLike = Tensor | np.ndarray
+
+# Both components of a computed cross product of a and b carry an absolute rounding error below
+# 8u |a||b|, u the unit roundoff of float64 (two differences, two products, one subtraction each).
+# A triangle whose largest angle has a smaller sine cannot be told from a segment in float64.
+_SINE_ROUNDOFF = 8 * 2.0**-53
+
+
+class MeshError(ValueError):
+    """The arrays do not describe a usable mesh; the message names the culprits and the remedy."""
+
+
+class CleanedMesh(NamedTuple):
+    """What `Mesh.cleaned` returns.
+
+    Attributes:
+        mesh: the valid mesh.
+        vertex_map: (n_before,) int64, the new index of each old vertex, -1 where it was dropped.
+        face_map: (m_before,) int64, the new index of each old face, -1 where it was dropped.
+    """
+
+    mesh: Mesh
+    vertex_map: Tensor
+    face_map: Tensor
+
+
+class Mesh:
+    """An immutable triangle mesh in the plane (D = 2) or in space (D = 3).
+
+    Open, closed, disconnected, non-orientable and non-manifold meshes are all fine; what is not is
+    listed under *Raises*. Lengths are in the mesh's own units. Geometry is computed in float64 and
+    handed out in the dtype of `vertices`.
+
+    Args:
+        vertices: (n, D) float32 or float64 positions.
+        faces: (m, 3) integer vertex indices; counter-clockwise seen from the side the normal points
+            to.
+
+    Raises:
+        MeshError: wrong shape or dtype, no faces, an index out of range or repeated within a face,
+            a vertex that is not finite, that requires grad, or that no face uses, or a face of zero
+            area. The message gives counts, the first indices, and the remedy.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    vertex_offsets: tuple[int, ...]
+    face_offsets: tuple[int, ...]
+
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+        vertices, faces = _as_tensors(vertices, faces)
+        _validate(vertices, faces)
+        # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
+        self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
+
+    def _assign(
+        self,
+        vertices: Tensor,
+        faces: Tensor,
+        vertex_offsets: tuple[int, ...],
+        face_offsets: tuple[int, ...],
+    ) -> None:
+        self.__dict__.update(
+            vertices=vertices,
+            faces=faces,
+            vertex_offsets=vertex_offsets,
+            face_offsets=face_offsets,
+        )
+
+    def __setattr__(self, name: str, value: object) -> NoReturn:
+        raise AttributeError(f"Mesh is immutable: build a new Mesh instead of setting {name!r}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in Mesh.__annotations__}
+
+    def __repr__(self) -> str:
+        return (
+            f"Mesh(n_vertices={self.n_vertices}, n_faces={self.n_faces}, dim={self.dim}, "
+            f"dtype={self.dtype}, device={self.device})"
+        )
+
+    # ---------------------------------------------------------------- sizes
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of vertices, n."""
+        return len(self.vertices)
+
+    @property
+    def n_faces(self) -> int:
+        """Number of faces, m."""
+        return len(self.faces)
+
+    @property
+    def dim(self) -> int:
+        """Dimension D of the ambient space."""
+        return self.vertices.shape[1]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating dtype of the vertices and of every derived quantity."""
+        return self.vertices.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the vertices and of every derived quantity."""
+        return self.vertices.device
+
+    def to(self, target: torch.dtype | torch.device | str) -> Mesh:
+        """The same mesh in another floating dtype or on another device."""
+        moved = object.__new__(Mesh)
+        faces = self.faces if isinstance(target, torch.dtype) else self.faces.to(target)
+        vertices = self.vertices.to(target)
+        _validate(vertices, faces)  # a narrower dtype can collapse faces
+        moved._assign(vertices, faces, self.vertex_offsets, self.face_offsets)
+        return moved
+
+    # ---------------------------------------------------------------- geometry
+
+    @cached_property
+    def _doubled_area_vectors(self) -> Tensor:
+        """(m, 3) or (m,) float64: e × e' per face, a signed number in the plane."""
+        return _doubled_area_vectors(self.vertices.double()[self.faces])[0]
+
+    @cached_property
+    def _double_areas(self) -> Float[Tensor, "m"]:
+        """Float64 areas, for operators that are assembled in double whatever the mesh's dtype."""
+        cross = self._doubled_area_vectors
+        return (cross.abs() if self.dim == 2 else torch.linalg.vector_norm(cross, dim=1)) / 2
+
+    @cached_property
+    def _double_frames(self) -> Float[Tensor, "m D 2"]:
+        """Float64 frames (see `frames`)."""
+        if self.dim == 2:
+            return torch.eye(2, dtype=torch.float64, device=self.device).expand(self.n_faces, 2, 2)
+        a, b = self.vertices.double()[self.faces[:, :2]].unbind(1)
+        x = torch.nn.functional.normalize(b - a, dim=1, eps=0)
+        normal = torch.nn.functional.normalize(self._doubled_area_vectors, dim=1, eps=0)
+        return torch.stack([x, torch.linalg.cross(normal, x)], dim=2)
+
+    @cached_property
+    def areas(self) -> Float[Tensor, "m"]:
+        """Area |tⱼ| of each face, in units²; positive also for clockwise faces of a planar mesh."""
+        return self._double_areas.to(self.dtype)
+
+    @cached_property
+    def normals(self) -> Float[Tensor, "m 3"]:
+        """Unit normal of each face; only in space."""
+        if self.dim != 3:
+            raise MeshError(f"normals need a mesh in space: vertices have D = {self.dim}, not 3")
+        cross = self._doubled_area_vectors
+        return torch.nn.functional.normalize(cross, dim=1, eps=0).to(self.dtype)
+
+    @cached_property
+    def frames(self) -> Float[Tensor, "m D 2"]:
+        """Orthonormal, oriented basis B of each tangent plane as columns: B₁ × B₂ = normal.
+
+        The first column points along the face's first edge. In the plane, the identity.
+        Nothing computed by this package depends on this choice (paper, appendix).
+        """
+        return self._double_frames.to(self.dtype)
+
+    @cached_property
+    def centroids(self) -> Float[Tensor, "m D"]:
+        """Barycentre of each face."""
+        return self.vertices[self.faces].mean(dim=1)
+
+    @cached_property
+    def vertex_areas(self) -> Float[Tensor, "n"]:
+        """Lumped mass |Vⱼ|: a third of the area around each vertex."""
+        thirds = (self._double_areas / 3).repeat_interleave(3)
+        total = torch.zeros(self.n_vertices, dtype=torch.float64, device=self.device)
+        return total.index_add(0, self.faces.flatten(), thirds).to(self.dtype)
+
+    # ---------------------------------------------------------------- topology
+
+    @cached_property
+    def components(self) -> Int[Tensor, "n"]:
+        """Label in 0 … n_components - 1 of the connected component of each vertex."""
+        a, b, c = self._numpy_faces.T
+        links = (np.concatenate([a, b]), np.concatenate([b, c]))
+        graph = sp.coo_matrix((np.ones(2 * self.n_faces), links), shape=(self.n_vertices,) * 2)
+        labels = csgraph.connected_components(graph, directed=False)[1]
+        return torch.from_numpy(labels.astype(np.int64)).to(self.device)
+
+    @property
+    def n_components(self) -> int:
+        """Number of connected components; faces that share a vertex are connected."""
+        return int(self.components.max()) + 1
+
+    @cached_property
+    def euler_characteristic(self) -> int:
+        """V - E + F."""
+        n_edges = len(_undirected_edges(self._numpy_faces)[0])
+        return self.n_vertices - n_edges + self.n_faces
+
+    @cached_property
+    def is_manifold(self) -> bool:
+        """Whether edges have at most two, consistently oriented faces and vertices one fan."""
+        faces = self._numpy_faces
+        half_edges = _half_edges(faces)
+        if len(np.unique(half_edges, axis=0)) < len(half_edges):
+            return False
+        return _count_fans(faces) == self.n_vertices
+
+    @cached_property
+    def boundary_loops(self) -> list[Tensor]:
+        """Each boundary as its cycle of vertices, along the faces' edges, longest first.
+
+        Raises:
+            MeshError: the boundary touches itself, or faces are inconsistently oriented.
+        """
+        edges, counts = _undirected_edges(self._numpy_faces)
+        half_edges = _half_edges(self._numpy_faces)
+        on_boundary = np.isin(
+            _edge_keys(np.sort(half_edges, axis=1)), _edge_keys(edges[counts == 1])
+        )
+        tails, heads = half_edges[on_boundary].T
+        for ends in (tails, heads):
+            if len(np.unique(ends)) < len(ends):
+                vertex = np.flatnonzero(np.bincount(ends) > 1)
+                raise MeshError(
+                    f"boundary_loops: the boundary passes {_some(vertex, 'vertex', 'vertices')} "
+                    "more than once; split such vertices, and orient the faces consistently"
+                )
+        return [torch.from_numpy(loop).to(self.device) for loop in _cycles(tails, heads)]
+
+    @cached_property
+    def is_disk(self) -> bool:
+        """Whether the mesh is a disk: connected, manifold, χ = 1 (hence one boundary)."""
+        return self.n_components == 1 and self.is_manifold and self.euler_characteristic == 1
+
+    @property
+    def _numpy_faces(self) -> np.ndarray:
+        return self.faces.cpu().numpy()
+
+    # ---------------------------------------------------------------- batches
+
+    @classmethod
+    def concatenate(cls, meshes: Sequence[Mesh]) -> Mesh:
+        """The disjoint union of meshes of one dimension, dtype and device: a heterogeneous batch.
+
+        Parts keep their order: `split_vertices` and `split_faces` take per-vertex and per-face
+        values of the union apart again.
+        """
+        if not meshes:
+            raise MeshError("Mesh.concatenate: needs at least one mesh")
+        kinds = sorted({f"D={mesh.dim} {mesh.dtype} {mesh.device}" for mesh in meshes})
+        if len(kinds) > 1:
+            raise MeshError(
+                f"Mesh.concatenate: meshes must agree in dimension, dtype and device, got {kinds}"
+            )
+        union = object.__new__(cls)
+        starts = np.cumsum([0] + [mesh.n_vertices for mesh in meshes]).tolist()
+        union._assign(
+            torch.cat([mesh.vertices for mesh in meshes]),
+            torch.cat([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]),
+            _concatenate_offsets([mesh.vertex_offsets for mesh in meshes]),
+            _concatenate_offsets([mesh.face_offsets for mesh in meshes]),
+        )
+        return union
+
+    @property
+    def n_parts(self) -> int:
+        """Number of meshes that were concatenated; 1 for a mesh built from arrays."""
+        return len(self.face_offsets) - 1
+
+    @cached_property
+    def part_of_vertex(self) -> Int[Tensor, "n"]:
+        """The part each vertex belongs to."""
+        return _owners(self.vertex_offsets, self.device)
+
+    @cached_property
+    def part_of_face(self) -> Int[Tensor, "m"]:
+        """The part each face belongs to."""
+        return _owners(self.face_offsets, self.device)
+
+    def split_vertices(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+        """Per-vertex values of a concatenated mesh, cut along `dim` into one tensor per part."""
+        return values.split(np.diff(self.vertex_offsets).tolist(), dim)
+
+    def split_faces(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+        """Per-face values of a concatenated mesh, cut along `dim` into one tensor per part."""
+        return values.split(np.diff(self.face_offsets).tolist(), dim)
+
+    # ---------------------------------------------------------------- repair
+
+    @staticmethod
+    def cleaned(
+        vertices: ArrayLike, faces: ArrayLike, *, merge_duplicates: bool = False
+    ) -> CleanedMesh:
+        """Drop what `Mesh` would reject, and say where everything went.
+
+        Faces with an index out of range or repeated, a vertex that is not finite, or zero area are
+        dropped, then vertices that no face uses. Positions are never moved.
+
+        Args:
+            vertices: (n, D) float32 or float64 positions.
+            faces: (m, 3) integer vertex indices.
+            merge_duplicates: first identify vertices with exactly equal coordinates, as the
+                triangle soups of STL files need.
+
+        Raises:
+            MeshError: wrong shape or dtype, or no face is left.
+        """
+        vertices, faces = _as_tensors(vertices, faces)
+        _check_arrays(vertices, faces)
+        merged = torch.arange(len(vertices), device=vertices.device)
+        if merge_duplicates and len(vertices):
+            merged = _first_of_equals(vertices)
+        in_range = ((faces >= 0) & (faces < len(vertices))).all(dim=1)
+        new_faces = merged[faces * in_range[:, None]] if len(vertices) else faces
+        keep = in_range & ~_repeated(new_faces)
+        keep[keep.clone()] &= vertices.isfinite().all(dim=1)[new_faces[keep]].all(dim=1)
+        keep[keep.clone()] &= ~_zero_area(vertices, new_faces[keep])
+        if not keep.any():
+            raise MeshError(f"Mesh.cleaned: none of the {len(faces)} faces is usable")
+
+        used = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
+        used[new_faces[keep].flatten()] = True
+        new_index = _new_indices(used)
+        mesh = Mesh(vertices[used], new_index[new_faces[keep]])
+        return CleanedMesh(mesh, new_index[merged], _new_indices(keep))
+
+
+# -------------------------------------------------------------------- validation
+
+
+def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
+    try:
+        vertices, faces = torch.as_tensor(vertices), torch.as_tensor(faces)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise MeshError(
+            f"Mesh: vertices and faces must be tensors or numeric arrays: {error}"
+        ) from error
+    if vertices.device != faces.device:
+        raise MeshError(
+            f"Mesh: vertices are on {vertices.device}, faces on {faces.device}; move one"
+        )
+    return vertices, faces.long() if _is_integer(faces) else faces
+
+
+def _is_integer(values: Tensor) -> bool:
+    return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+
+
+def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
+    """Shapes and dtypes: what even `Mesh.cleaned` cannot repair."""
+    if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
+        raise MeshError(f"Mesh: vertices must be (n, 2) or (n, 3), got {tuple(vertices.shape)}")
+    if vertices.dtype not in (torch.float32, torch.float64):
+        raise MeshError(
+            f"Mesh: vertices must be float32 or float64, got {vertices.dtype}; convert them"
+        )
+    if vertices.requires_grad:
+        raise MeshError(
+            "Mesh: vertices require grad, but operators are constant in the geometry, so its "
+            "gradient would silently be zero; pass vertices.detach()"
+        )
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise MeshError(
+            f"Mesh: faces must be (m, 3), got {tuple(faces.shape)}; triangulate polygons first"
+        )
+    if not _is_integer(faces):
+        raise MeshError(f"Mesh: faces must have an integer dtype, got {faces.dtype}")
+
+
+def _validate(vertices: Tensor, faces: Tensor) -> None:
+    _check_arrays(vertices, faces)
+    if len(faces) == 0:
+        raise MeshError("Mesh: no faces; an operator needs at least one triangle")
+    n = len(vertices)
+    _reject(((faces < 0) | (faces >= n)).any(dim=1), f"with a vertex index outside 0 … {n - 1}")
+    _reject(_repeated(faces), "with a repeated vertex index")
+    finite = vertices.isfinite().all(dim=1)
+    _reject(~finite, "with a coordinate that is not finite", ("vertex", "vertices"))
+    used = torch.zeros(n, dtype=torch.bool, device=vertices.device)
+    used[faces.flatten()] = True
+    _reject(~used, "that no face uses", ("vertex", "vertices"))
+    _reject(_zero_area(vertices, faces), "of zero area")
+    if not _doubled_area_vectors(vertices.double()[faces])[0].isfinite().all():
+        raise MeshError("Mesh: areas overflow float64; rescale the vertices")
+
+
+def _reject(bad: Bool[Tensor, "k"], what: str, noun: tuple[str, str] = ("face", "faces")) -> None:
+    if bad.any():
+        culprits = _some(bad.nonzero()[:, 0].cpu().numpy(), *noun)
+        raise MeshError(f"Mesh: {culprits} {what}; Mesh.cleaned(vertices, faces) drops them")
+
+
+def _some(indices: np.ndarray, singular: str, plural: str, show: int = 5) -> str:
+    """'3 faces [7, 8, 12]', shortened after the first few indices."""
+    listed = ", ".join(map(str, indices[:show])) + (", …" if len(indices) > show else "")
+    return f"{len(indices)} {singular if len(indices) == 1 else plural} [{listed}]"
+
+
+def _repeated(faces: Int[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
+    a, b, c = faces.unbind(1)
+    return (a == b) | (b == c) | (c == a)
+
+
+def _doubled_area_vectors(corners: Float[Tensor, "m 3 D"]) -> tuple[Tensor, Tensor]:
+    """Cross product of two edges of each triangle, and the product of their lengths.
+
+    Any two edges give the same cross product, but on a needle those at the widest corner (the two
+    shortest) lose no digits to cancellation.
+    """
+    edges = corners.roll(-1, dims=1) - corners  # edge i leaves corner i
+    longest = torch.linalg.vector_norm(edges, dim=2).argmax(dim=1)
+    rows = torch.arange(len(corners), device=corners.device)
+    after, before = edges[rows, (longest + 1) % 3], edges[rows, (longest + 2) % 3]
+    lengths = torch.linalg.vector_norm(after, dim=1) * torch.linalg.vector_norm(before, dim=1)
+    if corners.shape[2] == 2:
+        return after[:, 0] * before[:, 1] - after[:, 1] * before[:, 0], lengths
+    return torch.linalg.cross(after, before), lengths
+
+
+def _zero_area(vertices: Tensor, faces: Tensor) -> Bool[Tensor, "m"]:
+    """Faces whose area is indistinguishable from zero in float64, at any scale of the mesh."""
+    cross, lengths = _doubled_area_vectors(vertices.double()[faces])
+    size = cross.abs() if cross.ndim == 1 else torch.linalg.vector_norm(cross, dim=1)
+    return size <= _SINE_ROUNDOFF * lengths
+
+
+# -------------------------------------------------------------------- topology
+
+
+def _half_edges(faces: np.ndarray) -> np.ndarray:
+    """(3m, 2) directed edges, all first edges, then all second, then all third."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def _undirected_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(E, 2) sorted unique edges, and the number of faces at each."""
+    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0, return_counts=True)
+
+
+def _edge_keys(edges: np.ndarray) -> np.ndarray:
+    """One integer per (i, j), injective for indices below 2³¹."""
+    return edges[:, 0] * np.int64(2**31) + edges[:, 1]
+
+
+def _count_fans(faces: np.ndarray) -> int:
+    """Number of face fans around all vertices, of a mesh whose half-edges are unique.
+
+    Corners are glued where their faces share an edge; a vertex is manifold if all its corners
+    become one.
+    """
+    m = len(faces)
+    tails, heads = _half_edges(faces).T
+    tail_corner = np.arange(3 * m)
+    head_corner = np.concatenate(
+        [tail_corner[m:], tail_corner[:m]]
+    )  # corner i + 1 of the same face
+    graph = sp.csr_matrix(
+        (tail_corner + 1, (tails, heads)), shape=(faces.max() + 1,) * 2
+    )  # half-edge index + 1, so that 0 means none
+    opposite = np.asarray(graph[heads, tails]).ravel() - 1
+    inner = np.flatnonzero(opposite >= 0)
+    pairs = (tail_corner[inner], head_corner[opposite[inner]])
+    glue = sp.coo_matrix((np.ones(len(inner)), pairs), shape=(3 * m, 3 * m))
+    return int(csgraph.connected_components(glue, directed=False)[0])
+
+
+def _cycles(tails: np.ndarray, heads: np.ndarray) -> list[np.ndarray]:
+    """Vertex cycles of a graph in which each vertex has one successor, longest first."""
+    if len(tails) == 0:
+        return []
+    size = int(max(tails.max(), heads.max())) + 1
+    graph = sp.csr_matrix((np.ones(len(tails)), (tails, heads)), shape=(size, size))
+    labels = csgraph.connected_components(graph, directed=False)[1]
+    starts = tails[np.unique(labels[tails], return_index=True)[1]]
+    loops = [csgraph.depth_first_order(graph, s, return_predecessors=False) for s in starts]
+    return sorted((loop.astype(np.int64) for loop in loops), key=len, reverse=True)
+
+
+# -------------------------------------------------------------------- indices
+
+
+def _concatenate_offsets(parts: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    sizes = np.concatenate([np.diff(offsets) for offsets in parts])
+    return tuple(np.concatenate([[0], np.cumsum(sizes)]).tolist())
+
+
+def _owners(offsets: tuple[int, ...], device: torch.device) -> Tensor:
+    sizes = torch.tensor(offsets, device=device).diff()
+    return torch.arange(len(sizes), device=device).repeat_interleave(sizes)
+
+
+def _first_of_equals(vertices: Tensor) -> Int[Tensor, "n"]:
+    """For each vertex, the lowest index of a vertex with the same coordinates."""
+    _, group = torch.unique(vertices, dim=0, return_inverse=True)
+    index = torch.arange(len(vertices), device=vertices.device)
+    first = torch.full((len(vertices),), len(vertices), device=vertices.device)
+    return first.scatter_reduce(0, group, index, "amin")[group]
+
+
+def _new_indices(keep: Bool[Tensor, "k"]) -> Int[Tensor, "k"]:
+    """Position of each kept entry among the kept, -1 elsewhere."""
+    return torch.where(keep, keep.cumsum(0) - 1, -1)

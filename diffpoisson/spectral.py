@@ -1,0 +1,201 @@
+"""Laplacian eigenpairs on the Poisson solver's own factor, and the signatures built from them.
+
+Shift-invert Lanczos needs the pseudo-inverse of L. On fields of mean zero, the pinned Cholesky
+factor followed by the projection to mean zero *is* that pseudo-inverse, so no second factorisation
+is made; the constants of each component, which it annihilates, are the eigenvectors of eigenvalue
+zero.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffpoisson.gradient import laplacian
+from diffpoisson.mesh import Mesh, MeshError
+from diffpoisson.poisson import PoissonSolver
+
+Mass = Literal["barycentric", "voronoi"]
+
+
+def laplacian_eigenpairs(
+    mesh: Mesh,
+    n_eigenpairs: int,
+    *,
+    mass: Mass = "barycentric",
+    solver: PoissonSolver | None = None,
+) -> tuple[Float[Tensor, "k"], Float[Tensor, "n k"]]:
+    """The smallest solutions of L φ = λ M φ, ascending, with φᵀMφ = I.
+
+    Not differentiable. Eigenvectors are unique up to sign, and up to rotation where eigenvalues
+    coincide.
+
+    Args:
+        mesh: the domain.
+        n_eigenpairs: k, counting one zero eigenvalue per connected component.
+        mass: lumped mass M: thirds of the areas, or mixed Voronoi areas (Meyer et al. 2003), in
+            units².
+        solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+
+    Returns:
+        eigenvalues (k,) in 1/units², eigenvectors (n, k) in 1/units; in the dtype of the mesh.
+
+    Raises:
+        MeshError: the mesh has fewer than k vertices.
+    """
+    n, zeros = mesh.n_vertices, mesh.n_components
+    if not 1 <= n_eigenpairs <= n:
+        raise MeshError(
+            f"laplacian_eigenpairs: a mesh of {n} vertices has {n} eigenpairs, not {n_eigenpairs}"
+        )
+    areas = lumped_mass(mesh, mass).double().cpu().numpy()
+    wanted = n_eigenpairs - zeros
+    # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.
+    if wanted > 0 and 2 * wanted + 1 < n - zeros:
+        solver = solver or PoissonSolver(mesh)
+        pairs = _lanczos(solver, areas, wanted)
+    else:
+        L = laplacian(mesh).toarray()
+        pairs = scipy.linalg.eigh(L, np.diag(areas))
+        pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
+    values = np.concatenate([np.zeros(zeros), pairs[0]])[:n_eigenpairs]
+    vectors = np.concatenate([_constants(mesh, areas), pairs[1]], axis=1)[:, :n_eigenpairs]
+    return torch.from_numpy(values).to(mesh.vertices), torch.from_numpy(vectors).to(mesh.vertices)
+
+
+def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
+    """Area of each vertex's cell, positive, summing to the area of the mesh, in units².
+
+    Raises:
+        ValueError: unknown kind of mass.
+    """
+    if mass == "barycentric":
+        return mesh.vertex_areas
+    if mass != "voronoi":
+        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
+    shares = _voronoi_shares(mesh.vertices.double()[mesh.faces]) * mesh.areas.double()[:, None]
+    total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
+    return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)
+
+
+def wave_kernel_signature(
+    mesh: Mesh,
+    n_energies: int = 50,
+    *,
+    n_eigenpairs: int = 50,
+    mass: Mass = "barycentric",
+    scale_invariant: bool = True,
+    solver: PoissonSolver | None = None,
+) -> Float[Tensor, "n e"]:
+    """Wave-kernel signature of each vertex (Aubry et al. 2011, eq. 4).
+
+    WKS(x, e) = Σₖ φₖ(x)² wₖ(e) / Σₖ wₖ(e),  wₖ(e) = exp(-(e - log λₖ)² / 2σ²), over the non-zero
+    eigenvalues λ₁ … λ_K; energies e are spread evenly from log λ₁ + 2δ to log λ_K - 2δ with
+    δ = (log λ_K - log λ₁) / n_energies and σ = 7δ.
+
+    Args:
+        mesh: the surface. Invariant to isometries, also to those of its parts: in several
+            components the spectrum is that of all together.
+        n_energies: number of values per vertex.
+        n_eigenpairs: size of the spectrum, counting one zero eigenvalue per connected component.
+        mass: see `laplacian_eigenpairs`.
+        scale_invariant: multiply by the total area, which makes the signature dimensionless with
+            average one; otherwise in 1/units².
+        solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+
+    Raises:
+        MeshError: too few vertices, or no two different non-zero eigenvalues, for this spectrum.
+    """
+    values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
+    log_values = values[mesh.n_components :].double().log()
+    if len(log_values) < 2 or log_values[0] == log_values[-1]:
+        raise MeshError(
+            f"wave_kernel_signature: {n_eigenpairs} eigenpairs hold {len(log_values)} non-zero "
+            f"ones on this mesh of {mesh.n_components} component(s); two different are needed"
+        )
+    delta = (log_values[-1] - log_values[0]) / n_energies
+    energies = torch.linspace(0, 1, n_energies, dtype=torch.float64, device=mesh.device)
+    energies = log_values[0] + 2 * delta + energies * (log_values[-1] - log_values[0] - 4 * delta)
+    weights = torch.softmax(
+        -((energies[None] - log_values[:, None]) ** 2) / (2 * (7 * delta) ** 2), dim=0
+    )
+    signature = vectors[:, mesh.n_components :].double() ** 2 @ weights
+    if scale_invariant:
+        signature = signature * mesh.areas.double().sum()
+    return signature.to(mesh.dtype)
+
+
+def heat_kernel_signature(
+    mesh: Mesh,
+    times: Float[Tensor, "t"],
+    *,
+    n_eigenpairs: int = 50,
+    mass: Mass = "barycentric",
+    solver: PoissonSolver | None = None,
+) -> Float[Tensor, "n t"]:
+    """Heat-kernel signature of each vertex (Sun et al. 2009): Σₖ exp(-λₖ t) φₖ(x)², in 1/units².
+
+    Args:
+        mesh: the surface.
+        times: (t,) diffusion times, in units².
+        n_eigenpairs: size of the truncated spectrum, counting the zero eigenvalues.
+        mass: see `laplacian_eigenpairs`.
+        solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+    """
+    values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
+    return vectors**2 @ torch.exp(-values[:, None] * times.to(values)[None])
+
+
+# -------------------------------------------------------------------- eigenproblem
+
+
+def _constants(mesh: Mesh, areas: np.ndarray) -> np.ndarray:
+    """(n, components) M-orthonormal eigenvectors of eigenvalue zero: one constant per component."""
+    labels = mesh.components.cpu().numpy()
+    totals = np.bincount(labels, weights=areas)
+    return np.eye(len(totals))[labels] / np.sqrt(totals)
+
+
+def _lanczos(solver: PoissonSolver, areas: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The k smallest non-zero eigenpairs by shift-invert Lanczos at zero, ascending."""
+    n = solver.mesh.n_vertices
+    null = _constants(solver.mesh, areas)
+
+    def pseudo_inverse(b: np.ndarray) -> np.ndarray:
+        # Drop the part outside the range of L, solve with one vertex per component at zero, and
+        # move the solution to mean zero: both projections together keep the operator symmetric.
+        b = b - areas * (null @ (null.T @ b))
+        x = solver.solve_laplacian(torch.from_numpy(b)[:, None]).numpy()[:, 0]
+        return x - null @ (null.T @ (areas * x))
+
+    start = np.random.default_rng(0).standard_normal(n)  # ARPACK's own start is not reproducible
+    values, vectors = scipy.sparse.linalg.eigsh(
+        sp.csr_matrix((n, n)),  # shift-invert mode at zero needs only L⁻¹ and M
+        k,
+        M=sp.diags(areas),
+        sigma=0.0,
+        v0=start,
+        OPinv=scipy.sparse.linalg.LinearOperator((n, n), matvec=pseudo_inverse, dtype=np.float64),
+    )
+    order = np.argsort(values)
+    return values[order], vectors[:, order]
+
+
+def _voronoi_shares(corners: Float[Tensor, "m 3 D"]) -> Float[Tensor, "m 3"]:
+    """Share of each corner in its face's area: Voronoi, or ½ and ¼ where an angle is obtuse."""
+    edges = corners.roll(1, dims=1) - corners.roll(-1, dims=1)  # edge i is opposite to corner i
+    squared = (edges**2).sum(-1)
+    others = squared.sum(1, keepdim=True) - 2 * squared  # 2 |eⱼ||eₖ| cos αᵢ
+    sine_twice = squared * others  # ∝ sin 2αᵢ
+    weights = sine_twice.roll(1, dims=1) + sine_twice.roll(-1, dims=1)
+    shares = weights / weights.sum(1, keepdim=True)
+    obtuse = others < 0
+    mixed = torch.where(obtuse, 0.5, 0.25).to(shares)
+    return torch.where(obtuse.any(1, keepdim=True), mixed, shares)

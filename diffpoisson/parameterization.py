@@ -1,0 +1,242 @@
+"""Flattening a disk: Tutte's embedding, SLIM, and rigid alignment. The only file that uses libigl.
+
+Tutte: boundary on a circle, interior solving L uv = 0. With uniform weights the result is an
+embedding (Tutte 1963; Floater 1997); cotangent weights distort less but can flip faces next to
+obtuse angles.
+
+SLIM (Rabinovich et al. 2017) descends from a flip-free map on the symmetric Dirichlet energy
+Σ |tⱼ| (‖Jⱼ‖² + ‖Jⱼ⁻¹‖²) / Σ |tⱼ|, which is 4 at an isometry, and never flips a face.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from diffpoisson.distortion import flipped, symmetric_dirichlet
+from diffpoisson.factor import CholeskyFactor
+from diffpoisson.gradient import jacobians, laplacian
+from diffpoisson.mesh import Mesh, MeshError
+
+
+class SlimResult(NamedTuple):
+    """What `slim` returns.
+
+    Attributes:
+        uv: (n, 2) flip-free map in the mesh's own units, dtype and device.
+        energies: mean symmetric Dirichlet energy of the initial map and after each iteration.
+        converged: whether the last iteration's relative decrease was within the tolerance.
+    """
+
+    uv: Tensor
+    energies: list[float]
+    converged: bool
+
+
+def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
+    """A flip-free map of a disk onto a round disk of the same area.
+
+    The cotangent-harmonic map where it has no flips, else the uniform one, which in exact
+    arithmetic cannot have any.
+
+    Args:
+        mesh: a topological disk in space.
+
+    Returns:
+        (n, 2) positions around the origin, in the mesh's units; boundary vertices lie on the circle
+        at arc lengths proportional to the boundary's.
+
+    Raises:
+        MeshError: not a disk in space, or so distorted that rounding flips faces of the uniform
+            map.
+
+    References:
+        Tutte, "How to draw a graph", 1963. Floater, "Parametrization and smooth approximation of
+        surface triangulations", 1997.
+    """
+    _require_disk("tutte", mesh)
+    boundary = mesh.boundary_loops[0]
+    circle = _circle(mesh, boundary)
+    # Obtuse angles make cotangents negative, so that this Laplacian can fail to give an embedding,
+    # but it is positive definite on the interior whatever the angles.
+    uv = _harmonic_extension(laplacian(mesh), boundary, circle).to(mesh.vertices)
+    if flipped(jacobians(mesh, uv)).any():
+        uv = _harmonic_extension(_graph_laplacian(mesh), boundary, circle).to(mesh.vertices)
+        n_flipped = int(flipped(jacobians(mesh, uv)).sum())
+        if n_flipped:
+            raise MeshError(
+                f"tutte: rounding to {mesh.dtype} flips {n_flipped} of {mesh.n_faces} faces, which "
+                "shrank too far; use float64, or cut the surface into flatter pieces"
+            )
+    return uv
+
+
+def slim(
+    mesh: Mesh,
+    init: Float[Tensor, "n 2"],
+    *,
+    tolerance: float = 1e-6,
+    max_iterations: int = 500,
+) -> SlimResult:
+    """Minimise the symmetric Dirichlet energy of a flip-free map, by SLIM.
+
+    Args:
+        mesh: the surface, a topological disk in space.
+        init: (n, 2) flip-free map, in the mesh's units: its scale counts, since isometries are
+            sought.
+        tolerance: stop when an iteration lowers the energy by less than this fraction of it.
+        max_iterations: give up then, with `converged` False.
+
+    Raises:
+        MeshError: not a disk in space, or `init` flips faces, from which SLIM cannot start.
+        RuntimeError: libigl produced flips, as rounding can on nearly degenerate faces.
+
+    References:
+        Rabinovich, Poranne, Panozzo and Sorkine-Hornung, "Scalable locally injective mappings",
+        2017.
+    """
+    import igl  # noqa: PLC0415  (a heavy import that only flattening needs)
+
+    _require_disk("slim", mesh)
+    energies = [_mean_energy(mesh, init)]
+    if not math.isfinite(energies[0]):
+        count = int(flipped(jacobians(mesh, init)).sum())
+        raise MeshError(
+            f"slim: init flips {count} of {mesh.n_faces} faces, and SLIM keeps the signs it starts "
+            "with; start from tutte(mesh)"
+        )
+    # libigl's proximal term (1e-4 I) is absolute: only at a fixed scale does it mean the same.
+    scale = math.sqrt(float(mesh.areas.double().sum()))
+    data = igl.slim_precompute(
+        _fortran(mesh.vertices / scale),
+        np.asfortranarray(mesh.faces.cpu().numpy(), dtype=np.int32),
+        _fortran(init / scale),
+        igl.MappingEnergyType.SYMMETRIC_DIRICHLET,
+        np.zeros(0, dtype=np.int32),  # no soft constraints
+        np.zeros((0, 2), order="F"),
+        0.0,
+    )
+    uv, converged = init, False
+    while not converged and len(energies) <= max_iterations:
+        solution = np.ascontiguousarray(igl.slim_solve(data, 1)[:, :2])
+        uv = scale * torch.from_numpy(solution).to(mesh.vertices)
+        energies.append(_mean_energy(mesh, uv))
+        converged = energies[-2] - energies[-1] <= tolerance * energies[-1]
+    if not math.isfinite(energies[-1]):
+        raise RuntimeError(
+            f"slim: libigl returned flipped faces after {len(energies) - 1} iterations; the mesh "
+            "has nearly degenerate faces: remesh it"
+        )
+    return SlimResult(uv, energies, converged)
+
+
+def procrustes(
+    source: Float[Tensor, "*batch n 2"],
+    target: Float[Tensor, "*batch n 2"],
+    weights: Float[Tensor, "n"],
+    *,
+    reflect: bool = False,
+) -> Float[Tensor, "*batch n 2"]:
+    """The source moved rigidly onto the target: argmin over R, t of Σ wᵢ ‖R sᵢ + t - qᵢ‖².
+
+    Args:
+        source: (…, n, 2) points to move.
+        target: (…, n, 2) points to move them to.
+        weights: (n,) non-negative, e.g. `mesh.vertex_areas`.
+        reflect: allow a reflection where that fits better; otherwise only rotations.
+    """
+    w = (weights / weights.sum())[:, None]
+    target_mean = (w * target).sum(dim=-2, keepdim=True)
+    source = source - (w * source).sum(dim=-2, keepdim=True)
+    rotated, fit = _best_rotation(source, target - target_mean, w)
+    if reflect:
+        mirror = source.new_tensor([1, -1])
+        mirrored, mirrored_fit = _best_rotation(source * mirror, target - target_mean, w)
+        rotated = torch.where((mirrored_fit > fit)[..., None, None], mirrored, rotated)
+    return rotated + target_mean
+
+
+def _best_rotation(source: Tensor, target: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotated source, and the inner product with the target that the rotation maximises."""
+    x, y = source.unbind(-1)
+    dot = (w * source * target).sum(dim=(-2, -1))
+    cross = (w[:, 0] * (x * target[..., 1] - y * target[..., 0])).sum(dim=-1)
+    angle = torch.atan2(cross, dot)[..., None]  # where both vanish every angle is a minimum
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1), torch.hypot(dot, cross)
+
+
+def _circle(mesh: Mesh, boundary: Tensor) -> Float[Tensor, "b 2"]:
+    """Boundary vertices on the circle that encloses the mesh's area, spaced by arc length."""
+    loop = mesh.vertices.double()[boundary]
+    lengths = torch.linalg.vector_norm(loop.roll(-1, dims=0) - loop, dim=1)
+    arc = lengths.cumsum(0) - lengths  # from the first vertex to each
+    angle = 2 * math.pi * arc / lengths.sum()
+    radius = torch.sqrt(mesh.areas.double().sum() / math.pi)
+    return radius * torch.stack([angle.cos(), angle.sin()], dim=1)
+
+
+def _harmonic_extension(
+    L: sp.csr_matrix, boundary: Tensor, values: Float[Tensor, "b c"]
+) -> Float[Tensor, "n c"]:
+    """u with u = values on the boundary and (L u)ᵢ = 0 at every other vertex i."""
+    u = torch.zeros(L.shape[0], values.shape[1], dtype=torch.float64)
+    u[boundary.cpu()] = values.cpu()
+    interior = np.setdiff1d(np.arange(L.shape[0]), boundary.cpu().numpy())
+    if len(interior):
+        rhs = torch.from_numpy(-(L @ u.numpy())[interior])
+        u[interior] = CholeskyFactor(L[interior][:, interior]).multiply(rhs)
+    return u
+
+
+def _graph_laplacian(mesh: Mesh) -> sp.csr_matrix:
+    """D - A of the mesh's graph: Tutte's uniform weights."""
+    i, j = _half_edges(mesh).T
+    n = mesh.n_vertices
+    adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64)
+    return (sp.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+
+
+def _half_edges(mesh: Mesh) -> np.ndarray:
+    return mesh.faces.cpu().numpy()[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _mean_energy(mesh: Mesh, uv: Tensor) -> float:
+    """Area-weighted mean symmetric Dirichlet energy; infinite if any face is flipped."""
+    density = symmetric_dirichlet(jacobians(mesh, uv)).double()
+    areas = mesh.areas.double()
+    return float((areas * density).sum() / areas.sum())
+
+
+def _fortran(values: Tensor) -> np.ndarray:
+    return np.asfortranarray(values.detach().cpu().double().numpy())
+
+
+def _require_disk(operation: str, mesh: Mesh) -> None:
+    if mesh.dim != 3:
+        raise MeshError(
+            f"{operation}: flattens surfaces in space, got vertices with D = {mesh.dim}"
+        )
+    if mesh.is_disk:
+        return
+    if mesh.n_components > 1:
+        reason = f"{mesh.n_components} connected components; flatten each on its own"
+    elif not mesh.is_manifold:
+        reason = (
+            "an edge with three faces, a pinched vertex or inconsistent orientation; repair these"
+        )
+    else:
+        holes = len(mesh.boundary_loops)
+        genus = (2 - holes - mesh.euler_characteristic) // 2
+        reason = (
+            f"Euler characteristic {mesh.euler_characteristic}, {holes} boundary loops and "
+            f"genus {genus}; cut it to a disk, or fill the holes"
+        )
+    raise MeshError(f"{operation}: needs a topological disk, but this mesh has {reason}")

@@ -187,6 +187,17 @@ class Mesh:
         total = torch.zeros(self.n_vertices, dtype=torch.float64, device=self.device)
         return total.index_add(0, self.faces.flatten(), thirds).to(self.dtype)
 
+    @cached_property
+    def vertex_normals(self) -> Float[Tensor, "n 3"]:
+        """Unit vertex normals, the faces' weighted by area; zero where those cancel."""
+        if self.dim != 3:
+            raise MeshError(f"vertex_normals need a mesh in space: D = {self.dim}, not 3")
+        corners = self._doubled_area_vectors.repeat_interleave(3, dim=0)
+        total = torch.zeros(self.n_vertices, 3, dtype=torch.float64, device=self.device)
+        total = total.index_add(0, self.faces.flatten(), corners)
+        lengths = torch.linalg.vector_norm(total, dim=1, keepdim=True)
+        return torch.where(lengths > 0, total / lengths, 0).to(self.dtype)
+
     # ---------------------------------------------------------------- topology
 
     @cached_property

@@ -10,7 +10,6 @@ translations.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -63,6 +62,9 @@ class PoissonSolver:
         self._free_index = torch.from_numpy(free).to(mesh.device)
         self._divergence = LinearMap(SparseMatrix(divergence, mesh.device))
         self._inverse = LinearMap(factor)
+        # Computed here, not at first use: torch.compile cannot trace what fills a cache.
+        self._labels, _ = mesh.components, mesh.frames
+        self._mean_weights = _shares(mesh.vertex_areas.double(), self._labels)
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:
@@ -130,17 +132,9 @@ class PoissonSolver:
     def _fix_gauge(self, phi: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         if self.gauge == "vertex":
             return phi  # the anchors are at zero already
-        labels = self.mesh.components
-        moments = phi.new_zeros(self.mesh.n_components, phi.shape[1])
-        moments = moments.index_add(0, labels, self._mean_weights[:, None] * phi)
-        return phi - moments.index_select(0, labels)
-
-    @cached_property
-    def _mean_weights(self) -> Float[Tensor, "n"]:
-        """Share of each vertex in the area of its component, float64."""
-        labels, areas = self.mesh.components, self.mesh.vertex_areas.double()
-        totals = areas.new_zeros(self.mesh.n_components).index_add(0, labels, areas)
-        return areas / totals[labels]
+        means = phi.new_zeros(self.mesh.n_components, phi.shape[1])
+        means = means.index_add(0, self._labels, self._mean_weights[:, None] * phi)
+        return phi - means.index_select(0, self._labels)
 
     def __repr__(self) -> str:
         return f"PoissonSolver({self.mesh}, gauge={self.gauge!r})"
@@ -151,6 +145,12 @@ def solve_poisson(
 ) -> Float[Tensor, "*batch n c"]:
     """One-shot `PoissonSolver(mesh, gauge=gauge)(R)`; keep the solver to solve more than once."""
     return PoissonSolver(mesh, gauge=gauge)(R)
+
+
+def _shares(sizes: Float[Tensor, "n"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Each size as a share of the total of its label."""
+    totals = sizes.new_zeros(int(labels.max()) + 1).index_add(0, labels, sizes)
+    return sizes / totals[labels]
 
 
 def _first_of_each(labels: np.ndarray) -> np.ndarray:

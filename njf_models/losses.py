@@ -1,0 +1,63 @@
+"""Supervised losses of a predicted map: distance of vertices and of Jacobians to a target map's."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+import diffpoisson as dp
+from njf_models.features import Shape
+from njf_models.njf import Prediction, centre_areas, centre_vertices
+
+VERTEX_WEIGHT = 10.0  # λ of the paper's eq. 8; the authors' experiments use it too
+
+
+class Loss(NamedTuple):
+    """A weighted sum and its terms, each a scalar averaged over the batch."""
+
+    total: Float[Tensor, ""]
+    vertices: Float[Tensor, ""]
+    jacobians: Float[Tensor, ""]
+
+
+def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*batch n c"]) -> Loss:
+    """10 Σ |Vⱼ| ‖Φⱼ - Ψⱼ‖² + Σ |tⱼ| ‖Rⱼ - Jⱼ‖² at unit total area, averaged over the shapes.
+
+    Areas enter as shares of their shape's area, so that a batch weighs its shapes alike and the
+    loss does not depend on the number of faces.
+
+    Args:
+        shape: the source(s).
+        prediction: what the network made of them.
+        target: (…, n, c) Ψ, the images of the vertices, in any position.
+    """
+    n_parts = shape.mesh.n_parts
+    difference = prediction.vertices - centre_areas(shape, target)
+    vertices = shape.vertex_weights.to(difference.dtype) * difference.square().sum(-1)
+    difference = prediction.jacobians - dp.jacobians(shape.mesh, target)
+    jacobians = shape.face_weights.to(difference.dtype) * difference.square().sum((-2, -1))
+    return _sum(vertices.sum(-1).mean() / n_parts, jacobians.sum(-1).mean() / n_parts)
+
+
+def official_loss(
+    shape: Shape, prediction: Prediction, target: Float[Tensor, "*batch n c"]
+) -> Loss:
+    """The authors' experiments: mean squared errors over all entries, 10 vertices + Jacobians.
+
+    Args:
+        shape: the source(s).
+        prediction: what the network made of them, of a model with `centering="vertex"`.
+        target: (…, n, c) Ψ, the images of the vertices, in any position.
+    """
+    vertices = (prediction.vertices - centre_vertices(shape, target)).square().mean()
+    jacobians = (prediction.jacobians - dp.jacobians(shape.mesh, target)).square().mean()
+    return _sum(vertices, jacobians)
+
+
+def _sum(vertices: Tensor, jacobians: Tensor) -> Loss:
+    return Loss(VERTEX_WEIGHT * vertices + jacobians, vertices, jacobians)
+
+
+LOSSES = {"paper": paper_loss, "official": official_loss}

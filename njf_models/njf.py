@@ -1,0 +1,138 @@
+"""Neural Jacobian Fields (Aigerman et al. 2022): predict a matrix per face, then solve Poisson."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+import diffpoisson as dp
+from njf_models.features import Shape
+from njf_models.field import FieldMLP
+from njf_models.pointnet import PointNet
+
+Centering = Literal["area", "vertex"]
+
+
+class Prediction(NamedTuple):
+    """Output of `NeuralJacobianField`.
+
+    Attributes:
+        matrices: (…, m, c, 3) P, the matrix predicted for each face.
+        jacobians: (…, m, c, 2) R = P B, its restriction to the tangent plane.
+        vertices: (…, n, c) Φ, the map whose Jacobians are closest to R.
+    """
+
+    matrices: Float[Tensor, "*batch m c 3"]
+    jacobians: Float[Tensor, "*batch m c 2"]
+    vertices: Float[Tensor, "*batch n c"]
+
+
+class NeuralJacobianField(nn.Module):
+    """The paper's network: PointNet codes, a field of matrices, restriction, Poisson solve.
+
+    Args:
+        face_features: number of centroid features (6, or 6 + k with a k-dimensional WKS).
+        point_features: number of features of the points the encoder sees; 0 for no encoder.
+        encodes_target: the code is [source code | target code] from one shared encoder, not the
+            source's alone.
+        code_size: size z of one code.
+        parameters: number of user parameters appended to the code (a target pose, handle
+            positions).
+        output_dim: c, 3 for maps to space, 2 for maps to the plane.
+        centering: whether the emitted map has area-weighted mean zero on each component (the
+            paper), or its plain mean over vertices is zero (the authors' experiments).
+        width: size of the field's hidden layers.
+    """
+
+    def __init__(
+        self,
+        face_features: int,
+        point_features: int,
+        *,
+        encodes_target: bool = False,
+        code_size: int = 1000,
+        parameters: int = 0,
+        output_dim: int = 3,
+        centering: Centering = "area",
+        width: int = 128,
+    ) -> None:
+        super().__init__()
+        if centering not in ("area", "vertex"):
+            raise ValueError(f"centering must be 'area' or 'vertex', got {centering!r}")
+        self.encodes_target, self.output_dim, self.centering = encodes_target, output_dim, centering
+        self.encoder = PointNet(point_features, code_size) if point_features else None
+        n_codes = (1 + encodes_target) if point_features else 0
+        self.field = FieldMLP(
+            n_codes * code_size + parameters, face_features, output_dim * 3, width
+        )
+
+    def encode(
+        self,
+        source: Float[Tensor, "batch s f"] | None = None,
+        target: Float[Tensor, "batch t f"] | None = None,
+        parameters: Float[Tensor, "batch p"] | None = None,
+    ) -> Float[Tensor, "batch z"]:
+        """The global code: PointNet of source and target, and user parameters, side by side.
+
+        Args:
+            source: (batch, s, f) point features of the sources, if the model has an encoder.
+            target: (batch, t, f) point features of the targets, if it encodes them.
+            parameters: (batch, p) user parameters, if it has any.
+        """
+        clouds = [cloud for cloud in (source, target) if cloud is not None]
+        expected = 0 if self.encoder is None else 1 + self.encodes_target
+        if len(clouds) != expected:
+            raise ValueError(
+                f"encode: this model encodes {expected} point cloud(s), got {len(clouds)}"
+            )
+        codes = [self.encoder(cloud) for cloud in clouds] if self.encoder is not None else []
+        code = torch.cat([*codes, *([] if parameters is None else [parameters])], dim=-1)
+        if code.shape[-1] != self.field.code_size:
+            raise ValueError(
+                f"encode: the field expects a code of size {self.field.code_size}, "
+                f"got {code.shape[-1]}; check the number of parameters"
+            )
+        return code
+
+    def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
+        """The map of a shape for each code.
+
+        Args:
+            shape: one prepared shape, or several concatenated.
+            code: (…, z) codes for one shape, or (parts, z) one code for each of the concatenated
+                shapes.
+        """
+        mesh = shape.mesh
+        part_of_face = mesh.part_of_face if mesh.n_parts > 1 else None
+        if part_of_face is not None and code.shape[:-1] != (mesh.n_parts,):
+            raise ValueError(
+                f"NeuralJacobianField: {mesh.n_parts} concatenated shapes need codes of shape "
+                f"({mesh.n_parts}, z), got {tuple(code.shape)}"
+            )
+        outputs = self.field(shape.features, code, part_of_face)
+        offsets = outputs.unflatten(-1, (self.output_dim, 3))
+        P = offsets + torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
+        R = dp.restrict(P, mesh.frames)
+        return Prediction(P, R, self._centred(shape, shape.solver(R)))
+
+    def _centred(
+        self, shape: Shape, phi: Float[Tensor, "*batch n c"]
+    ) -> Float[Tensor, "*batch n c"]:
+        return centre_vertices(shape, phi) if self.centering == "vertex" else phi
+
+
+def centre_vertices(shape: Shape, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch n c"]:
+    """Translate the map of each part so that the plain mean of its vertices is zero."""
+    parts = shape.mesh.split_vertices(phi, dim=-2)
+    return torch.cat([part - part.mean(dim=-2, keepdim=True) for part in parts], dim=-2)
+
+
+def centre_areas(shape: Shape, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch n c"]:
+    """Translate the map of each part so that its area-weighted mean is zero."""
+    weighted = shape.vertex_weights.to(phi.dtype)[:, None] * phi
+    means = [part.sum(dim=-2, keepdim=True) for part in shape.mesh.split_vertices(weighted, dim=-2)]
+    parts = shape.mesh.split_vertices(phi, dim=-2)
+    return torch.cat([part - mean for part, mean in zip(parts, means, strict=True)], dim=-2)

@@ -234,7 +234,8 @@ class Mesh:
         """Each boundary as its cycle of vertices, along the faces' edges, longest first.
 
         Raises:
-            MeshError: the boundary touches itself, or faces are inconsistently oriented.
+            MeshError: the boundary touches itself or ends at a non-manifold edge, or faces are
+                inconsistently oriented.
         """
         edges, counts = _undirected_edges(self._numpy_faces)
         half_edges = _half_edges(self._numpy_faces)
@@ -249,6 +250,11 @@ class Mesh:
                     f"boundary_loops: the boundary passes {_some(vertex, 'vertex', 'vertices')} "
                     "more than once; split such vertices, and orient the faces consistently"
                 )
+        if (open_ends := np.setxor1d(tails, heads)).size:
+            raise MeshError(
+                f"boundary_loops: the boundary ends at {_some(open_ends, 'vertex', 'vertices')}, "
+                "on an edge of three or more faces; split such edges"
+            )
         return [torch.from_numpy(loop).to(self.device) for loop in _cycles(tails, heads)]
 
     @cached_property
@@ -354,7 +360,7 @@ class Mesh:
 
 def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     try:
-        vertices, faces = torch.as_tensor(vertices), torch.as_tensor(faces)
+        vertices, faces = _as_tensor(vertices), _as_tensor(faces)
     except (TypeError, ValueError, RuntimeError) as error:
         raise MeshError(
             f"Mesh: vertices and faces must be tensors or numeric arrays: {error}"
@@ -364,6 +370,11 @@ def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
             f"Mesh: vertices are on {vertices.device}, faces on {faces.device}; move one"
         )
     return vertices, faces.long() if _is_integer(faces) else faces
+
+
+def _as_tensor(values: ArrayLike) -> Tensor:
+    # torch cannot share arrays that are read-only or have negative strides, such as faces[:, ::-1].
+    return torch.as_tensor(values.copy() if isinstance(values, np.ndarray) else values)
 
 
 def _is_integer(values: Tensor) -> bool:
@@ -404,8 +415,22 @@ def _validate(vertices: Tensor, faces: Tensor) -> None:
     used[faces.flatten()] = True
     _reject(~used, "that no face uses", ("vertex", "vertices"))
     _reject(_zero_area(vertices, faces), "of zero area")
-    if not _doubled_area_vectors(vertices.double()[faces])[0].isfinite().all():
-        raise MeshError("Mesh: areas overflow float64; rescale the vertices")
+    _check_range(vertices, faces)
+
+
+def _check_range(vertices: Tensor, faces: Tensor) -> None:
+    """Areas must be normal numbers in the mesh's dtype, and their squares in float64.
+
+    Norms of area vectors pass through the squares.
+    """
+    cross = _doubled_area_vectors(vertices.double()[faces])[0]
+    squared = (cross.square() if cross.ndim == 1 else cross.square().sum(1)) / 4
+    for quantity in (squared, squared.sqrt().to(vertices.dtype)):
+        range_ = torch.finfo(quantity.dtype)
+        if not ((quantity >= range_.tiny) & (quantity <= range_.max)).all():
+            raise MeshError(
+                f"Mesh: areas leave the range of {vertices.dtype}; rescale the vertices"
+            )
 
 
 def _reject(bad: Bool[Tensor, "k"], what: str, noun: tuple[str, str] = ("face", "faces")) -> None:

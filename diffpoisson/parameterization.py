@@ -229,8 +229,11 @@ def _require_disk(operation: str, mesh: Mesh) -> None:
     if mesh.n_components > 1:
         reason = f"{mesh.n_components} connected components; flatten each on its own"
     elif not mesh.is_manifold:
+        edges = np.sort(_half_edges(mesh), axis=1)
+        crowded = int((np.unique(edges, axis=0, return_counts=True)[1] > 2).sum())
         reason = (
-            "an edge with three faces, a pinched vertex or inconsistent orientation; repair these"
+            f"{crowded} edges with more than two faces, or pinched vertices or inconsistent "
+            "orientation; repair these"
         )
     else:
         holes = len(mesh.boundary_loops)

@@ -127,7 +127,7 @@ def build_entry(
 ) -> Entry:
     """One patch of a mesh as a cache entry; without arrays if every attempt was rejected.
 
-    The stream of random numbers, (seed, index), is mixed with the mesh's content, or meshes with the
+    The stream of random numbers, (seed, index), is mixed with the content, or meshes with the
     same connectivity would be cut alike.
     """
     rng = np.random.default_rng(int(fingerprint(vertices, faces, stream), 16))

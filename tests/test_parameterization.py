@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import igl
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import diffpoisson as dp
+from diffpoisson.parameterization import procrustes, slim, tutte
+from tests import meshes, references
+
+
+def spiky_disk(seed: int, amplitude: float, size: int = 6) -> meshes.Arrays:
+    """Random heights: angles so obtuse that cotangent weights flip faces."""
+    flat, faces = meshes.planar_disk(seed, size)
+    heights = amplitude * np.random.default_rng(seed).standard_normal(len(flat))
+    return np.c_[flat, heights], faces
+
+
+def half_cylinder(size: int = 8) -> meshes.Arrays:
+    """A developable surface of area π/2 × 3 (less the chords')."""
+    flat, faces = meshes.planar_disk(1, size)
+    angle = np.pi / 2 * flat[:, 0]
+    return np.stack([np.sin(angle), 3 * flat[:, 1], np.cos(angle)], axis=1), faces
+
+
+def symmetric_dirichlet(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> float:
+    """Mean of ‖J‖² + ‖J⁻¹‖² from J's pseudo-inverse, or inf if libigl calls a face flipped."""
+    if len(igl.flipped_triangles(uv, faces)):
+        return np.inf
+    J = references.jacobians(vertices, faces, uv)
+    density = (J**2).sum((1, 2)) + (np.linalg.pinv(J) ** 2).sum((1, 2))
+    return float(np.average(density, weights=references.areas(vertices, faces)))
+
+
+# ------------------------------------------------------- Tutte
+
+
+@given(seed=meshes.seeds, amplitude=st.floats(0, 3), log_scale=st.floats(-3, 3))
+def test_tutte_embeds_the_disk_in_a_circle_of_its_area(
+    seed: int, amplitude: float, log_scale: float
+) -> None:
+    vertices, faces = spiky_disk(seed, amplitude)
+    vertices *= 10.0**log_scale
+    uv = tutte(dp.Mesh(vertices, faces)).numpy()
+    # Positive faces inside a convex, simply traversed boundary cannot overlap.
+    assert len(igl.flipped_triangles(uv, faces)) == 0
+    loop = np.asarray(igl.boundary_loop(faces))
+    radius = np.sqrt(references.areas(vertices, faces).sum() / np.pi)
+    np.testing.assert_allclose(np.linalg.norm(uv[loop], axis=1), radius, rtol=1e-12)
+    steps = np.diff(np.unwrap(np.arctan2(*uv[np.r_[loop, loop[0]]].T[::-1])))
+    lengths = np.linalg.norm(np.diff(vertices[np.r_[loop, loop[0]]], axis=0), axis=1)
+    np.testing.assert_allclose(steps, 2 * np.pi * lengths / lengths.sum(), atol=1e-12)
+
+
+def test_tutte_is_libigls_harmonic_map_where_that_has_no_flips() -> None:
+    vertices, faces = meshes.disk(3, 7)
+    uv = tutte(dp.Mesh(vertices, faces)).numpy()
+    loop = np.asarray(igl.boundary_loop(faces))
+    expected = igl.harmonic(vertices, faces, loop, np.ascontiguousarray(uv[loop]), 1)
+    np.testing.assert_allclose(uv, expected, atol=1e-12)
+
+
+def test_tutte_is_the_uniform_map_where_the_harmonic_one_flips() -> None:
+    vertices, faces = spiky_disk(0, 3.0)
+    uv = tutte(dp.Mesh(vertices, faces)).numpy()
+    loop = np.asarray(igl.boundary_loop(faces))
+    harmonic = igl.harmonic(vertices, faces, loop, np.ascontiguousarray(uv[loop]), 1)
+    assert len(igl.flipped_triangles(harmonic, faces)) > 0
+    adjacency = igl.adjacency_matrix(faces).toarray().astype(bool)
+    for vertex in np.setdiff1d(np.arange(len(uv)), loop):  # each is the mean of its neighbours
+        np.testing.assert_allclose(uv[vertex], uv[adjacency[vertex]].mean(0), atol=1e-12)
+
+
+def test_tutte_of_a_disk_without_interior_vertices() -> None:
+    mesh = dp.Mesh(*meshes.triangle())
+    assert not dp.flipped(dp.jacobians(mesh, tutte(mesh))).any()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (meshes.sphere(), "Euler characteristic 2, 0 boundary loops and genus 0"),
+        (meshes.torus(), "Euler characteristic 0, 0 boundary loops and genus 1"),
+        (meshes.annulus(), "Euler characteristic 0, 2 boundary loops and genus 0"),
+        (meshes.parts(), "3 connected components"),
+        (meshes.book(), "1 edges with more than two faces"),
+        (meshes.bowtie(), "pinched vertices"),
+        (meshes.moebius(), "inconsistent"),
+        (meshes.planar_disk(), "D = 2"),
+    ],
+)
+@pytest.mark.parametrize("operation", [tutte, lambda mesh: slim(mesh, mesh.vertices[:, :2])])
+def test_what_is_not_a_disk_is_named(operation, arrays, message) -> None:
+    with pytest.raises(dp.MeshError, match=message):
+        operation(dp.Mesh(*arrays))
+
+
+# ------------------------------------------------------- SLIM
+
+
+@given(seed=meshes.seeds)
+@settings(max_examples=5)
+def test_slim_energies_are_the_symmetric_dirichlet_energy_and_fall(seed: int) -> None:
+    vertices, faces = meshes.disk(seed, 6)
+    mesh = dp.Mesh(vertices, faces)
+    init = tutte(mesh)
+    result = slim(mesh, init)
+    assert result.converged
+    np.testing.assert_allclose(
+        [result.energies[0], result.energies[-1]],
+        [symmetric_dirichlet(vertices, faces, uv.numpy()) for uv in (init, result.uv)],
+        rtol=1e-9,
+    )
+    assert all(np.diff(result.energies) <= 1e-9)
+
+
+def test_slim_ends_at_a_minimum() -> None:
+    mesh = dp.Mesh(*meshes.disk(2, 6))
+    result = slim(mesh, tutte(mesh), tolerance=1e-12)
+    gradients = []
+    for uv in (tutte(mesh).requires_grad_(), result.uv.requires_grad_()):
+        (mesh.areas * dp.symmetric_dirichlet(dp.jacobians(mesh, uv))).sum().backward()
+        gradients.append(uv.grad.norm())
+    assert gradients[1] < 1e-4 * gradients[0]
+
+
+def test_slim_unrolls_a_developable_surface_isometrically() -> None:
+    vertices, faces = half_cylinder()
+    mesh = dp.Mesh(vertices, faces)
+    result = slim(mesh, tutte(mesh), tolerance=1e-9)
+    assert result.energies[-1] == pytest.approx(4, abs=1e-6)
+    uv = result.uv.numpy()
+    edges = igl.edges(faces)
+    lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (uv, vertices)]
+    np.testing.assert_allclose(*lengths, rtol=2e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e3])
+def test_slim_commutes_with_scaling(scale: float) -> None:
+    vertices, faces = meshes.disk(0, 6)
+    unit, scaled = dp.Mesh(vertices, faces), dp.Mesh(scale * vertices, faces)
+    expected, actual = slim(unit, tutte(unit)), slim(scaled, tutte(scaled))
+    np.testing.assert_allclose(actual.energies, expected.energies, rtol=1e-9)
+    torch.testing.assert_close(actual.uv, scale * expected.uv, rtol=1e-6, atol=1e-6 * scale)
+
+
+def test_slim_keeps_single_precision() -> None:
+    vertices, faces = meshes.disk(0, 6)
+    mesh = dp.Mesh(vertices.astype(np.float32), faces)
+    result = slim(mesh, tutte(mesh))
+    assert result.uv.dtype == torch.float32
+    assert not dp.flipped(dp.jacobians(mesh, result.uv)).any()
+
+
+def test_slim_reports_that_it_ran_out_of_iterations() -> None:
+    mesh = dp.Mesh(*meshes.disk(0, 6))
+    result = slim(mesh, tutte(mesh), max_iterations=1)
+    assert not result.converged
+    assert len(result.energies) == 2
+
+
+def test_slim_cannot_start_from_flips() -> None:
+    mesh = dp.Mesh(*meshes.disk(0, 6))
+    mirrored = tutte(mesh) * torch.tensor([1.0, -1])
+    with pytest.raises(dp.MeshError, match=rf"init flips {mesh.n_faces} of {mesh.n_faces} faces"):
+        slim(mesh, mirrored)
+
+
+# ------------------------------------------------------- Procrustes
+
+
+def kabsch(source: np.ndarray, target: np.ndarray, w: np.ndarray, reflect: bool) -> np.ndarray:
+    """The textbook solution by SVD."""
+    means = [np.average(x, axis=0, weights=w) for x in (source, target)]
+    U, _, Vt = np.linalg.svd((w[:, None] * (source - means[0])).T @ (target - means[1]))
+    D = np.diag([1, 1 if reflect else np.linalg.det(U @ Vt)])
+    return (source - means[0]) @ U @ D @ Vt + means[1]
+
+
+@given(seed=meshes.seeds, reflect=st.booleans())
+def test_procrustes_is_kabschs_solution(seed: int, reflect: bool) -> None:
+    rng = np.random.default_rng(seed)
+    source, target = rng.standard_normal((2, 12, 2)) + rng.standard_normal((2, 1, 2))
+    weights = rng.uniform(0, 1, 12)
+    actual = procrustes(*map(torch.from_numpy, (source, target, weights)), reflect=reflect)
+    np.testing.assert_allclose(actual, kabsch(source, target, weights, reflect), atol=1e-10)
+
+
+@given(seed=meshes.seeds)
+def test_procrustes_undoes_a_rigid_motion_but_no_reflection(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    target = rng.standard_normal((12, 2))
+    moved = target @ meshes.rotation(rng, target).T + rng.standard_normal(2)
+    weights = torch.ones(12, dtype=torch.float64)
+    target, moved = torch.from_numpy(target), torch.from_numpy(moved)
+    torch.testing.assert_close(procrustes(moved, target, weights), target)
+    mirrored = moved * torch.tensor([-1.0, 1])
+    torch.testing.assert_close(procrustes(mirrored, target, weights, reflect=True), target)
+    assert (procrustes(mirrored, target, weights) - target).norm() > 0.1
+
+
+def test_procrustes_aligns_each_of_a_batch() -> None:
+    source, target = torch.randn(2, 4, 9, 2, dtype=torch.float64)
+    weights = torch.rand(9, dtype=torch.float64)
+    batched = procrustes(source, target, weights)
+    for k in range(4):
+        torch.testing.assert_close(batched[k], procrustes(source[k], target[k], weights))

@@ -110,8 +110,9 @@ class Cache:
     def load(self, key: str) -> Entry | None:
         """The entry, or None where there is none; a corrupt file counts as none, with a warning."""
         try:
-            with np.load(self.path(key), allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
+            # Given a path instead, numpy leaves a truncated file open.
+            with self.path(key).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
         except FileNotFoundError:
             return None
         except _CORRUPT as error:

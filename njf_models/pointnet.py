@@ -30,4 +30,4 @@ class PointNet(nn.Module):
 
     def forward(self, points: Float[Tensor, "batch s f"]) -> Float[Tensor, "batch z"]:
         """Code of each point cloud; independent of the order of its points."""
-        return self.layers(points.mT).amax(dim=-1)
+        return self.layers(points.mT).max(dim=-1).values

@@ -25,9 +25,9 @@ from torch.utils.data import DataLoader, Dataset
 import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Shape, point_features
-from njf_models.losses import LOSSES
+from njf_models.losses import LOSSES, Loss
 from njf_models.metrics import count_flips
-from njf_models.njf import NeuralJacobianField
+from njf_models.njf import NeuralJacobianField, Prediction
 
 
 @dataclass(frozen=True)
@@ -132,24 +132,31 @@ class NJFTraining(lightning.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one packed batch."""
-        prediction = self.model(batch.shape, self.model.encode(batch.points))
-        loss = self.loss(batch.shape, prediction, batch.target)
-        size = {"batch_size": len(batch.points)}
-        self.log("train/loss", loss.total, prog_bar=True, on_step=False, on_epoch=True, **size)
-        return loss.total
+        loss = self._predict(batch)[1].total
+        size = len(batch.points)
+        self.log("train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size)
+        return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Losses and flips of one packed batch."""
-        prediction = self.model(batch.shape, self.model.encode(batch.points))
-        loss = self.loss(batch.shape, prediction, batch.target)
-        size = {"batch_size": len(batch.points)}
-        self.log("validation/loss", loss.total, prog_bar=True, **size)
-        self.log("validation/vertices", loss.vertices, **size)
-        self.log("validation/jacobians", loss.jacobians, **size)
+        """Losses and flips per shape of one packed batch."""
+        prediction, loss = self._predict(batch)
+        size = len(batch.points)
+        values = {f"validation/{name}": value for name, value in loss._asdict().items()}
         if self.model.output_dim == 2:
             J = dp.jacobians(batch.shape.mesh, prediction.vertices)
-            flips = count_flips(J) / len(batch.points)
-            self.log("validation/flips", flips.float(), prog_bar=True, **size)
+            values["validation/flips"] = count_flips(J).float() / size
+        self.log("validation/loss", loss.total, prog_bar=True, batch_size=size)
+        self.log_dict(values, batch_size=size)
+
+    def transfer_batch_to_device(
+        self, batch: Batch, device: torch.device, dataloader_idx: int
+    ) -> Batch:
+        """The batch as it is: it lives where its factors do."""
+        return batch
+
+    def _predict(self, batch: Batch) -> tuple[Prediction, Loss]:
+        prediction = self.model(batch.shape, self.model.encode(batch.points))
+        return prediction, self.loss(batch.shape, prediction, batch.target)
 
     def configure_optimizers(self) -> Any:
         """Adam with the paper's schedule."""
@@ -161,7 +168,7 @@ class NJFTraining(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
 
-def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Batch]:
+def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Example]:
     """Packed batches. Factors live in this process, so there are no workers."""
     return DataLoader(examples, batch_size=batch_size, shuffle=shuffle, collate_fn=Batch.pack)
 

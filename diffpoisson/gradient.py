@@ -132,7 +132,7 @@ def jacobians(
             f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
         )
     J = columns_to_matrices(gradient_operator(mesh).gradient(vertices_to_columns(phi)), phi.shape)
-    return extend(J, mesh.frames) if extrinsic else J
+    return extend(J, mesh._double_frames) if extrinsic else J
 
 
 def divergence(mesh: Mesh, R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "*batch n c"]:
@@ -167,7 +167,7 @@ def as_intrinsic(
             f"{operation}: expected one matrix per face, (…, m={mesh.n_faces}, c, {sizes}), "
             f"got {tuple(R.shape)}"
         )
-    return R if R.shape[-1] == d else restrict(R, mesh.frames)
+    return R if R.shape[-1] == d else restrict(R, mesh._double_frames)
 
 
 # ------------------------------------------------------- fields as columns, for sparse products

@@ -181,11 +181,16 @@ class Mesh:
         return self.vertices[self.faces].mean(dim=1)
 
     @cached_property
-    def vertex_areas(self) -> Float[Tensor, "n"]:
-        """Lumped mass |Vⱼ|: a third of the area around each vertex."""
+    def _double_vertex_areas(self) -> Float[Tensor, "n"]:
+        """Float64 vertex areas (see `vertex_areas`)."""
         thirds = (self._double_areas / 3).repeat_interleave(3)
         total = torch.zeros(self.n_vertices, dtype=torch.float64, device=self.device)
-        return total.index_add(0, self.faces.flatten(), thirds).to(self.dtype)
+        return total.index_add(0, self.faces.flatten(), thirds)
+
+    @cached_property
+    def vertex_areas(self) -> Float[Tensor, "n"]:
+        """Lumped mass |Vⱼ|: a third of the area around each vertex."""
+        return self._double_vertex_areas.to(self.dtype)
 
     @cached_property
     def vertex_normals(self) -> Float[Tensor, "n 3"]:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
@@ -63,8 +63,8 @@ class PoissonSolver:
         self._divergence = LinearMap(SparseMatrix(divergence, mesh.device))
         self._inverse = LinearMap(factor)
         # Computed here, not at first use: torch.compile cannot trace what fills a cache.
-        self._labels, _ = mesh.components, mesh.frames
-        self._mean_weights = _shares(mesh.vertex_areas.double(), self._labels)
+        self._labels, _ = mesh.components, mesh._double_frames
+        self._mean_weights = _shares(mesh._double_vertex_areas, self._labels)
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:

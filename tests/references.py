@@ -77,14 +77,15 @@ def components(n_vertices: int, faces: np.ndarray) -> np.ndarray:
 def poisson(vertices: np.ndarray, faces: np.ndarray, R: np.ndarray) -> np.ndarray:
     """(n, c) minimiser from libigl's gradient, its areas and a dense pseudo-inverse."""
     G = igl.grad(vertices, faces).toarray()  # rows ordered by direction, then by face
-    A = sp.diags(np.tile(igl.doublearea(vertices, faces) / 2, vertices.shape[1]))
+    # libigl's areas are signed in the plane.
+    A = sp.diags(np.tile(np.abs(igl.doublearea(vertices, faces)) / 2, vertices.shape[1]))
     stacked = np.concatenate(list(np.moveaxis(R, -1, 0)))
     phi = np.linalg.pinv(G.T @ A @ G, hermitian=True) @ (G.T @ (A @ stacked))
     return centred(vertices, faces, phi)
 
 
 def dirichlet_energy(
-    vertices: np.ndarray, faces: np.ndarray, phi: np.ndarray, R: np.ndarray
+    vertices: np.ndarray, faces: np.ndarray, R: np.ndarray, phi: np.ndarray
 ) -> float:
     """Σ |t| ‖∇φ - R‖², with R restricted to the tangent planes."""
     E = edge_vectors(vertices, faces).astype(np.float64)

@@ -8,6 +8,7 @@ plane.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +94,7 @@ class PatchSampler:
         vertices, flatness = align(mesh.vertices.numpy(), mesh.faces.numpy())
         if flatness < self.options.min_flatness:
             raise PatchRejectedError("not flat enough")
-        scale = float(np.sqrt(mesh.areas.sum()))
+        scale = math.sqrt(mesh.areas.sum())
         return Patch(vertices, mesh.faces.numpy(), flatness, radius / scale)
 
 

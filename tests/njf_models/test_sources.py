@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.machinery
+import importlib.util
 import inspect
 import itertools
 import subprocess

@@ -67,7 +67,9 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
         "summary": table,
         "patches": [asdict(record) for record in after],
     }
-    (options.out / "results.json").write_text(json.dumps(results, indent=1))
+    # JSON has no infinity: a map with a flip has the energy null.
+    finite = json.loads(json.dumps(results), parse_constant=lambda _: None)
+    (options.out / "results.json").write_text(json.dumps(finite, indent=1))
     draw(options.out, test, maps, before, after)
     print(f"\n{options.out / 'results.png'}  {options.out / 'results.json'}")
     return table

@@ -67,7 +67,7 @@ def evaluate_uv(
         prediction = model(batch.shape, model.encode(batch.points))
         milliseconds = 1000 * (time.perf_counter() - start)
         records.append(_record(examples.patches[index], batch, prediction, milliseconds))
-        maps.append(prediction.vertices)
+        maps.append(prediction.vertices[0])
     return records, maps
 
 
@@ -77,7 +77,7 @@ def summarise(records: Sequence[UVRecord]) -> dict[str, float]:
     def column(name: str) -> np.ndarray:
         return np.array([getattr(record, name) for record in records], dtype=np.float64)
 
-    return {
+    summary = {
         "patches": len(records),
         "loss": column("loss").mean(),
         "L2-V": column("l2_v").mean(),
@@ -88,10 +88,11 @@ def summarise(records: Sequence[UVRecord]) -> dict[str, float]:
         "flips per patch, raw": column("flips_raw").mean(),
         "D>10 per patch": column("distorted").mean(),
         "D>10 per patch, raw": column("distorted_raw").mean(),
-        "symmetric Dirichlet, median": float(np.median(column("energy"))),
-        "symmetric Dirichlet of SLIM, median": float(np.median(column("slim_energy"))),
-        "milliseconds per patch, median": float(np.median(column("milliseconds"))),
+        "symmetric Dirichlet, median": np.median(column("energy")),
+        "symmetric Dirichlet of SLIM, median": np.median(column("slim_energy")),
+        "milliseconds per patch, median": np.median(column("milliseconds")),
     }
+    return {name: float(value) for name, value in summary.items()}
 
 
 def format_table(columns: dict[str, dict[str, float]]) -> str:

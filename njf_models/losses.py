@@ -22,7 +22,7 @@ class Loss(NamedTuple):
     jacobians: Float[Tensor, ""]
 
 
-def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*batch n c"]) -> Loss:
+def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#batch n c"]) -> Loss:
     """10 Σ |Vⱼ| ‖Φⱼ - Ψⱼ‖² + Σ |tⱼ| ‖Rⱼ - Jⱼ‖² at unit total area, averaged over the shapes.
 
     Areas enter as shares of their shape's area, so that a batch weighs its shapes alike and the
@@ -42,7 +42,7 @@ def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*bat
 
 
 def official_loss(
-    shape: Shape, prediction: Prediction, target: Float[Tensor, "*batch n c"]
+    shape: Shape, prediction: Prediction, target: Float[Tensor, "*#batch n c"]
 ) -> Loss:
     """The authors' experiments: mean squared errors over all entries, 10 vertices + Jacobians.
 

@@ -12,14 +12,14 @@ DISTORTION_LIMIT = 10.0
 
 
 def l2_vertices(
-    predicted: Float[Tensor, "*batch n c"], target: Float[Tensor, "*batch n c"]
+    predicted: Float[Tensor, "*batch n c"], target: Float[Tensor, "*#batch n c"]
 ) -> Float[Tensor, "*batch"]:
     """L2-V: mean distance of vertices × 10², each map centred and scaled to largest radius one."""
     return 100 * torch.linalg.vector_norm(_unit(predicted) - _unit(target), dim=-1).mean(-1)
 
 
 def l2_jacobians(
-    predicted: Float[Tensor, "*batch m c d"], target: Float[Tensor, "*batch m c d"]
+    predicted: Float[Tensor, "*batch m c d"], target: Float[Tensor, "*#batch m c d"]
 ) -> Float[Tensor, "*batch"]:
     """L2-J: mean Frobenius distance of restricted Jacobians × 10."""
     return 10 * torch.linalg.matrix_norm(predicted - target).mean(-1)
@@ -27,7 +27,7 @@ def l2_jacobians(
 
 def l2_normals(
     predicted: Float[Tensor, "*batch n 3"],
-    target: Float[Tensor, "*batch n 3"],
+    target: Float[Tensor, "*#batch n 3"],
     faces: Int[Tensor, "m 3"],
 ) -> Float[Tensor, "*batch"]:
     """L2-N: mean angle between the faces' normals, in degrees. A collapsed face counts as 90°."""

@@ -103,7 +103,7 @@ def draw_curve(ax: Axes, log: Path) -> None:
 
 
 def render_checkerboard(
-    mesh: dp.Mesh, uv: Float[Tensor, "n 2"], size: int = 320
+    mesh: dp.Mesh, uv: Float[Tensor, "n 2"], size: int = 320, square: float = SQUARE
 ) -> Float[np.ndarray, "size size 3"]:
     """An orthographic picture of a mesh in space, by splatting random surface samples.
 
@@ -111,6 +111,7 @@ def render_checkerboard(
         mesh: the surface, seen from above (+z) and the side.
         uv: (n, 2) texture coordinates, in the mesh's units.
         size: pixels of each side.
+        square: side of the checkerboard's squares, in the units of uv.
     """
     samples = dp.sample_surface(
         mesh, _SAMPLES_PER_PIXEL * size**2, generator=torch.Generator().manual_seed(0)
@@ -118,7 +119,7 @@ def render_checkerboard(
     points = samples.interpolate(mesh, mesh.vertices @ _view().T)
     texture = samples.interpolate(mesh, uv.double())
     normals = (mesh.normals @ _view().T)[samples.faces].numpy()
-    checker = (texture / SQUARE).floor().sum(dim=1).remainder(2).numpy()
+    checker = (texture / square).floor().sum(dim=1).remainder(2).numpy()
     colour = np.where(checker[:, None] > 0, (0.98, 0.97, 0.94), (0.16, 0.42, 0.67))
     colour = np.where(normals[:, 2:] < 0, 0.5 * colour + (0.45, 0.2, 0.1), colour)  # back side
     shade = 0.45 + 0.55 * np.abs(normals @ _LIGHT)

@@ -1,0 +1,94 @@
+"""The field MLP and PointNet against the plain modules they stand for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+from torch.testing import assert_close
+
+from njf_models.field import FieldMLP, RowGroupNorm
+from njf_models.pointnet import PointNet
+from tests.njf_models.shapes import randomised
+
+
+def plain_field(model: FieldMLP) -> nn.Sequential:
+    """The same network as one `nn.Sequential` with `nn.GroupNorm`, on (code | features)."""
+    first = model.layers[0]
+    layers: list[nn.Module] = []
+    sizes = (first.in_features, 128, 128, 128, 128)
+    for fan_in in sizes[:-1]:
+        layers += [nn.Linear(fan_in, 128), nn.GroupNorm(4, 128), nn.ReLU()]
+    plain = nn.Sequential(*layers, nn.Linear(128, model.layers[-1].out_features)).double()
+    plain.load_state_dict(model.layers.state_dict())  # strict: same names and shapes
+    return plain
+
+
+def test_row_group_norm_is_group_norm_with_gradients():
+    ours, theirs = RowGroupNorm(4, 128).double(), nn.GroupNorm(4, 128).double()
+    randomised(ours)
+    theirs.load_state_dict(ours.state_dict())
+    x = torch.randn(50, 128, dtype=torch.float64, requires_grad=True)
+    y, expected = ours(x), theirs(x)
+    assert_close(y, expected, rtol=1e-12, atol=1e-12)
+    w = torch.randn_like(y)
+    for ours_grad, theirs_grad in zip(
+        torch.autograd.grad((y * w).sum(), [x, *ours.parameters()]),
+        torch.autograd.grad((expected * w).sum(), [x, *theirs.parameters()]),
+        strict=True,
+    ):
+        assert_close(ours_grad, theirs_grad, rtol=1e-10, atol=1e-10)
+
+
+def test_split_first_layer_is_the_plain_network_on_code_and_features():
+    model = randomised(FieldMLP(20, 6))
+    features = torch.randn(40, 6, dtype=torch.float64)
+    codes = torch.randn(3, 20, dtype=torch.float64)
+    expected = torch.stack(
+        [plain_field(model)(torch.cat([c.expand(40, 20), features], dim=1)) for c in codes]
+    )
+    assert_close(model(features, codes), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_packed_faces_get_the_code_of_their_part():
+    model = randomised(FieldMLP(20, 6))
+    features = torch.randn(30, 6, dtype=torch.float64)
+    codes = torch.randn(3, 20, dtype=torch.float64)
+    part = torch.randint(3, (30,))
+    expected = plain_field(model)(torch.cat([codes[part], features], dim=1))
+    assert_close(model(features, codes, part), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_last_layer_starts_at_zero():
+    model = FieldMLP(4, 6)
+    assert model(torch.randn(9, 6), torch.randn(2, 4)).abs().max() == 0
+
+
+def test_pointnet_is_blind_to_the_order_of_points_but_not_to_their_places():
+    net = randomised(PointNet(6, code_size=16))
+    points = torch.randn(2, 100, 6, dtype=torch.float64)
+    code = net(points)
+    assert code.shape == (2, 16)
+    assert_close(net(points[:, torch.randperm(100)]), code, rtol=1e-11, atol=1e-11)
+    assert (net(points + 0.1) - code).abs().max() > 1e-3
+
+
+def test_pointnet_norms_act_over_the_channels_of_a_group_and_all_points():
+    """The network written out, mean and variance over (channels of the group) × (points)."""
+    net = randomised(PointNet(6, code_size=16))
+    points = torch.randn(1, 30, 6, dtype=torch.float64)
+    x = points[0].T
+    for i, groups in enumerate((4, 4, 8, 8), start=1):
+        conv, norm = (getattr(net.layers, f"{kind}{i}") for kind in ("conv", "norm"))
+        x = conv.weight[..., 0] @ x + conv.bias[:, None]
+        blocks = x.reshape(groups, -1)
+        mean, variance = blocks.mean(1, keepdim=True), blocks.var(1, keepdim=True, correction=0)
+        x = ((blocks - mean) / (variance + 1e-5).sqrt()).reshape(x.shape)
+        x = norm.weight[:, None] * x + norm.bias[:, None]
+        x = x.relu() if i < 4 else x
+    assert_close(net(points)[0], x.max(dim=1).values, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("code_size", [8, 1000])
+def test_pointnet_code_size(code_size):
+    assert PointNet(6, code_size)(torch.randn(1, 10, 6)).shape == (1, code_size)

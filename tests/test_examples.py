@@ -1,0 +1,35 @@
+"""Each example runs, at its smallest size, and its numbers are asserted on."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.slow
+def test_uv_train(tmp_path, monkeypatch):
+    monkeypatch.setenv("DIFFPOISSON_CACHE", str(tmp_path / "cache"))
+    main = runpy.run_path(str(ROOT / "examples" / "uv_train.py"))["main"]
+    options = ["--csg", "4", "--patches", "3", "--faces", "150", "500", "--minutes", "0.2"]
+    table = main([*options, "--out", str(tmp_path / "run")])
+    assert table["trained"]["loss"] < table["untrained"]["loss"]
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert len(results["patches"]) == table["trained"]["patches"]
+    splits = [set(results["splits"][name]) for name in ("train", "validation", "test")]
+    assert not (splits[0] & splits[1] or splits[0] & splits[2] or splits[1] & splits[2])
+    assert (tmp_path / "run" / "results.png").stat().st_size > 100_000
+
+
+def test_readme_example():
+    block = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert block is not None
+    namespace: dict = {}
+    exec(block.group(1), namespace)
+    assert namespace["R"].grad.isfinite().all()
+    assert namespace["R"].grad.abs().max() > 0

@@ -1,8 +1,8 @@
 """Properties of a correct gradient and Poisson layer, each a function that asserts.
 
 `test_gradient.py` and `test_poisson.py` run them on the package as it is; `test_faults.py` runs
-them on deliberately broken versions of it, to show that they would notice. Each builds its own meshes
-and solvers, so that it sees whatever version is in place when it is called.
+them on deliberately broken versions of it, to show that they would notice. Each builds its own
+meshes and solvers, so that it sees whatever version is in place when it is called.
 """
 
 from __future__ import annotations
@@ -331,7 +331,9 @@ def small_layer() -> tuple[dp.PoissonSolver, Tensor]:
 @check
 def check_backward() -> None:
     solver, R = small_layer()
-    assert gradcheck(solver, R.requires_grad_(), raise_exception=False)
+    R.requires_grad_()
+    assert gradcheck(solver, R, raise_exception=False)
+    assert gradcheck(partial(dp.divergence, solver.mesh), R, raise_exception=False)
 
 
 @check
@@ -354,10 +356,13 @@ def check_adjoint_of_the_solve() -> None:
 
 @check
 def check_forward_mode() -> None:
+    """The operators are linear: the tangent is the operator of the tangent."""
     solver, R = small_layer()
-    value, tangent = jvp(solver, (R,), (2 * R,))
-    assert_near(tangent, 2 * solver(R), LOCAL)
-    assert_near(value, solver(R), LOCAL)
+    # Also one factor of the composition alone: in it, two wrong signs would cancel.
+    for operator in (solver, partial(dp.divergence, solver.mesh)):
+        value, tangent = jvp(operator, (R,), (2 * R,))
+        assert_near(tangent, 2 * operator(R), LOCAL)
+        assert_near(value, operator(R), LOCAL)
 
 
 @check

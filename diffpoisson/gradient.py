@@ -72,27 +72,26 @@ def _to_torch(matrix: sp.csr_matrix, dtype: torch.dtype, device: torch.device) -
 
 
 class GradientOperator:
-    """∇ and ∇ᵀA of one mesh as sparse matrices, assembled once; see `gradient_operator`."""
+    """∇ of one mesh and what is made of it, assembled once; see `gradient_operator`.
+
+    Attributes:
+        matrix: ∇ as a SciPy matrix (2m, n), float64; row 2j + d is tangent direction d on face j.
+        gradient: ∇ as a differentiable map, (n, k) to (2m, k).
+        adjoint: ∇ᵀ as a differentiable map, (2m, k) to (n, k).
+        weights: (2m, 1) float64 area of the face of each row: the diagonal of A.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.n_vertices, self.n_faces, self._device = mesh.n_vertices, mesh.n_faces, mesh.device
         self.matrix = _gradient_matrix(mesh)
-        self._areas = mesh._double_areas.cpu().numpy()
-
-    @cached_property
-    def gradient(self) -> LinearMap:
-        """∇: (n, k) vertex values to (2m, k); row 2j + d is tangent direction d on face j."""
-        return LinearMap(SparseMatrix(self.matrix, self._device))
-
-    @cached_property
-    def divergence(self) -> LinearMap:
-        """∇ᵀA: (2m, k) to (n, k)."""
-        return LinearMap(SparseMatrix(self.divergence_matrix, self._device))
+        self.gradient = LinearMap(SparseMatrix(self.matrix, mesh.device))
+        self.adjoint = self.gradient.T
+        self.weights = mesh._double_areas.repeat_interleave(2)[:, None]
 
     @cached_property
     def divergence_matrix(self) -> sp.csr_matrix:
         """∇ᵀA as a SciPy matrix (n, 2m)."""
-        return (sp.diags(self._areas.repeat(2)) @ self.matrix).T.tocsr()
+        weights = self.weights[:, 0].cpu().numpy()
+        return (sp.diags(weights) @ self.matrix).T.tocsr()
 
     @cached_property
     def laplacian(self) -> sp.csr_matrix:
@@ -148,7 +147,8 @@ def divergence(mesh: Mesh, R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "*
         ValueError: R does not have one such matrix per face.
     """
     R = as_intrinsic("divergence", mesh, R)
-    return columns_to_vertices(gradient_operator(mesh).divergence(matrices_to_columns(R)), R.shape)
+    operator, columns = gradient_operator(mesh), matrices_to_columns(R)
+    return columns_to_vertices(operator.adjoint(operator.weights.to(R.dtype) * columns), R.shape)
 
 
 def laplacian(mesh: Mesh) -> sp.csr_matrix:

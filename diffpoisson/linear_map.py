@@ -43,19 +43,25 @@ class Matrix(ABC):
 
 
 class _Handle(OpaqueBase):
-    """A matrix as the dispatcher sees it: an opaque constant."""
+    """A matrix, or the transpose of one, as the dispatcher sees it: an opaque constant."""
 
-    def __init__(self, matrix: Matrix) -> None:
-        self.matrix = matrix
+    def __init__(self, matrix: Matrix, transposed: bool = False) -> None:
+        self._matrix, self._transposed = matrix, transposed
+
+    @property
+    def matrix(self) -> Matrix:
+        """The matrix; a transpose is made at its first use, since some maps need none."""
+        if self._transposed:
+            self._matrix, self._transposed = self._matrix.transposed(), False
+        return self._matrix
 
 
 class LinearMap:
     """The differentiable map x ↦ A x of a constant matrix A, on (cols, k) dense columns."""
 
-    def __init__(self, matrix: Matrix, transposed: Matrix | None = None) -> None:
+    def __init__(self, matrix: Matrix) -> None:
         self.shape = matrix.shape
-        self.matrix = matrix
-        self._handles = (_Handle(matrix), _Handle(transposed or matrix.transposed()))
+        self._handles = (_Handle(matrix), _Handle(matrix, transposed=True))
 
     def __call__(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
         """A x, in the dtype and on the device of x."""
@@ -64,8 +70,9 @@ class LinearMap:
     @property
     def T(self) -> LinearMap:
         """The adjoint map x ↦ Aᵀ x."""
-        forward, adjoint = self._handles
-        return LinearMap(adjoint.matrix, forward.matrix)
+        adjoint = object.__new__(LinearMap)
+        adjoint.shape, adjoint._handles = self.shape[::-1], self._handles[::-1]
+        return adjoint
 
 
 register_opaque_type(_Handle, typ="reference")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,7 +20,7 @@ def restrict(
         ValueError: the shapes do not fit.
     """
     _check("restrict", P, frames, "D", frames.shape[1])
-    return P @ frames.to(P.dtype)
+    return _product(P, frames)
 
 
 def extend(
@@ -37,7 +38,13 @@ def extend(
         ValueError: the shapes do not fit.
     """
     _check("extend", R, frames, "d", frames.shape[2])
-    return R @ frames.to(R.dtype).mT
+    return _product(R, frames.mT)
+
+
+def _product(matrices: Tensor, frames: Tensor) -> Tensor:
+    # Autocast would round geometry to half precision behind the caller's back.
+    with torch.autocast(matrices.device.type, enabled=False):
+        return matrices @ frames.to(matrices.dtype)
 
 
 def _check(operation: str, matrices: Tensor, frames: Tensor, name: str, columns: int) -> None:

@@ -196,12 +196,14 @@ def _harmonic_extension(
 
 
 def _graph_laplacian(mesh: Mesh) -> sp.csr_matrix:
-    """D - A of the mesh's graph: Tutte's uniform weights."""
+    """D - A of the mesh's graph: Tutte's uniform weights.
+
+    Only right at interior vertices, whose edges are all half-edges of two faces, one each way.
+    """
     i, j = _half_edges(mesh).T
     n = mesh.n_vertices
     adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
-    adjacency = ((adjacency + adjacency.T) > 0).astype(np.float64)
-    return (sp.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+    return (sp.diags(np.bincount(i, minlength=n).astype(np.float64)) - adjacency).tocsr()
 
 
 def _half_edges(mesh: Mesh) -> np.ndarray:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from njf_models.datasets.cache import Cache, Entry, fingerprint
 from njf_models.datasets.patches import Patch, PatchOptions, PatchRejectedError, PatchSampler
 from njf_models.datasets.sources import RawMesh
 
-_VERSION = "1"
+_VERSION = "1"  # change it with anything that changes the entries, here or in `patches`
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ def build_uv_patches(
     seed: int = 0,
     options: PatchOptions | None = None,
     n_energies: int = 50,
-    cache: Cache | None = None,
+    cache_root: Path | None = None,
     n_jobs: int = -1,
 ) -> tuple[list[UVPatch], Counter[str]]:
     """Cut, align and flatten random patches, in parallel and through the cache.
@@ -90,7 +91,7 @@ def build_uv_patches(
         seed: patch i of a mesh depends on the mesh's content, i and this only.
         options: sizes and filters of the patches.
         n_energies: length k of the wave-kernel signature.
-        cache: by default the one named "uv" in the default folder.
+        cache_root: folder of all caches, by default `cache.default_root()`.
         n_jobs: processes, -1 for one per core.
 
     Returns:
@@ -98,7 +99,7 @@ def build_uv_patches(
         reason.
     """
     options = options or PatchOptions()
-    cache = cache or Cache("uv", _VERSION)
+    cache = Cache("uv", _VERSION, cache_root)
     draws = [
         (raw, (raw.vertices, raw.faces, (seed, i), options, n_energies))
         for raw in raw_meshes

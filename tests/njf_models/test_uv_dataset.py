@@ -12,7 +12,6 @@ from hypothesis import given
 from torch.utils.data import DataLoader
 
 from njf_models.datasets import uv
-from njf_models.datasets.cache import Cache
 from njf_models.datasets.patches import PatchOptions
 from njf_models.datasets.sources import CSGParts, RawMesh
 from njf_models.datasets.uv import UVPatch, UVPatchDataset, build_uv_patches, split_by_mesh
@@ -25,7 +24,7 @@ Built = tuple[list[UVPatch], Counter[str]]
 
 def build(root: Path, **changes: object) -> Built:
     arguments = {"seed": 0, "options": OPTIONS, "n_energies": 20, "n_jobs": 1} | changes
-    return build_uv_patches(SOURCES, 3, cache=Cache("uv", "test", root), **arguments)
+    return build_uv_patches(SOURCES, 3, cache_root=root, **arguments)
 
 
 @pytest.fixture(scope="module")
@@ -114,18 +113,14 @@ def test_the_seed_and_the_content_choose_the_patches(built: Built, tmp_path: Pat
         p.vertices.shape == q.vertices.shape for p, q in zip(other, built[0], strict=True)
     )
     stretched = replace(SOURCES[0], name="stretched", vertices=SOURCES[0].vertices * [1, 1, 1.01])
-    patches, _ = build_uv_patches(
-        [stretched], 1, options=OPTIONS, cache=Cache("uv", "test", tmp_path), n_jobs=1
-    )
+    patches, _ = build_uv_patches([stretched], 1, options=OPTIONS, cache_root=tmp_path, n_jobs=1)
     assert patches[0].vertices.shape != built[0][0].vertices.shape
 
 
 def test_a_mesh_without_patches_is_counted_not_fatal(tmp_path: Path) -> None:
     raw = RawMesh("small", *meshes.sphere(), "MIT", "test", "small")
     options = replace(OPTIONS, attempts=3)
-    patches, counts = build_uv_patches(
-        [raw], 2, options=options, cache=Cache("uv", "test", tmp_path), n_jobs=1
-    )
+    patches, counts = build_uv_patches([raw], 2, options=options, cache_root=tmp_path, n_jobs=1)
     assert patches == []
     assert counts == {"component too small": 6}
 

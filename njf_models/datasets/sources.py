@@ -95,7 +95,7 @@ class DogBones:
 class CSGParts:
     """Random solids: unions and differences of boxes, cylinders, cones and balls, evenly remeshed.
 
-    The boolean is exact (manifold3d). Its long thin triangles are split to a fine edge length and
+    manifold3d guarantees a manifold. Its long thin triangles are split to a fine edge length and
     shortest edges are then collapsed, which leaves nearly equilateral faces and edges rounded at
     their scale.
 

@@ -18,6 +18,7 @@ registration below shrink to two decorators.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -48,12 +49,10 @@ class _Handle(OpaqueBase):
     def __init__(self, matrix: Matrix, transposed: bool = False) -> None:
         self._matrix, self._transposed = matrix, transposed
 
-    @property
+    @cached_property
     def matrix(self) -> Matrix:
         """The matrix; a transpose is made at its first use, since some maps need none."""
-        if self._transposed:
-            self._matrix, self._transposed = self._matrix.transposed(), False
-        return self._matrix
+        return self._matrix.transposed() if self._transposed else self._matrix
 
 
 class LinearMap:

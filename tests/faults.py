@@ -100,7 +100,7 @@ def unweighted_everywhere(patch):
 
     def init(original, self, mesh):
         original(self, mesh)
-        self._areas = np.ones_like(self._areas)
+        self.weights = torch.ones_like(self.weights)
 
     wrap_method(patch, gradient.GradientOperator, "__init__", init)
 

@@ -16,6 +16,7 @@ from diffpoisson.distortion import (
 )
 from diffpoisson.gradient import divergence, jacobians, laplacian
 from diffpoisson.mesh import CleanedMesh, Mesh, MeshError
+from diffpoisson.parameterization import SlimResult, procrustes, slim, tutte
 from diffpoisson.poisson import PoissonSolver, solve_poisson
 from diffpoisson.restriction import extend, restrict
 from diffpoisson.sampling import SurfaceSamples, sample_surface
@@ -31,6 +32,7 @@ __all__ = [
     "Mesh",
     "MeshError",
     "PoissonSolver",
+    "SlimResult",
     "SurfaceSamples",
     "arap",
     "area_distortion",
@@ -47,10 +49,13 @@ __all__ = [
     "lscm",
     "lumped_mass",
     "mips",
+    "procrustes",
     "restrict",
     "sample_surface",
     "singular_values",
+    "slim",
     "solve_poisson",
     "symmetric_dirichlet",
+    "tutte",
     "wave_kernel_signature",
 ]

@@ -77,6 +77,12 @@ class CholeskyFactor(Matrix):
         """Itself: A is symmetric."""
         return self
 
+    def __del__(self) -> None:
+        # cholespy frees its work space when the number of columns changes, but not at the end.
+        if hasattr(self, "_solver"):
+            nothing = torch.empty(self.shape[0], 0, dtype=torch.float64, device=self._device)
+            self._solver.solve(nothing, torch.empty_like(nothing))
+
     def __reduce__(self) -> tuple[Any, ...]:
         return CholeskyFactor, self._recipe
 

@@ -37,12 +37,15 @@ class CholeskyFactor(Matrix):
             raise ValueError(f"CholeskyFactor: expected a square matrix, got shape {matrix.shape}")
         # cholespy accepts NaN silently, and with its CSC input it edits the caller's memory: give
         # it COO.
-        coo = matrix.tocsr().tocoo()  # sums duplicate entries
+        csr = matrix.tocsr(copy=True)
+        csr.sum_duplicates()
+        coo = csr.tocoo(copy=False)
         if not np.isfinite(coo.data).all():
             raise ValueError("CholeskyFactor: the matrix has entries that are not finite")
         self.shape = (rows, cols)
-        self._recipe = (matrix, device)
+        self._recipe = (csr, device)
         self._device = torch.device(device)
+        self._has_work_space = False
         arrays = (coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data.astype(np.float64))
         try:
             self._solver = cholespy.CholeskySolverD(
@@ -71,6 +74,8 @@ class CholeskyFactor(Matrix):
         x = torch.empty_like(b)
         if b.shape[1]:
             self._solver.solve(b, x)
+            self._has_work_space = not b.is_cuda
+            self._has_work_space = True
         return x
 
     def transposed(self) -> CholeskyFactor:
@@ -78,8 +83,9 @@ class CholeskyFactor(Matrix):
         return self
 
     def __del__(self) -> None:
-        # cholespy frees its work space when the number of columns changes, but not at the end.
-        if hasattr(self, "_solver"):
+        # cholespy frees its work space when the number of columns changes, but not at the end;
+        # where there is none to free, that call would crash.
+        if getattr(self, "_has_work_space", False):
             nothing = torch.empty(self.shape[0], 0, dtype=torch.float64, device=self._device)
             self._solver.solve(nothing, torch.empty_like(nothing))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from typing import Any
 
@@ -45,13 +46,13 @@ class CholeskyFactor(Matrix):
         self.shape = (rows, cols)
         self._recipe = (csr, device)
         self._device = torch.device(device)
-        self._has_work_space = False
+        self._release: weakref.finalize[..., CholeskyFactor] | None = None
         arrays = (coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data.astype(np.float64))
         try:
             self._solver = cholespy.CholeskySolverD(
                 rows, *(torch.from_numpy(a).to(device) for a in arrays), cholespy.MatrixType.COO
             )
-        except ValueError as error:
+        except (ValueError, RuntimeError) as error:
             raise ValueError(
                 f"CholeskyFactor: the matrix is not positive definite: {error}"
             ) from error
@@ -74,20 +75,13 @@ class CholeskyFactor(Matrix):
         x = torch.empty_like(b)
         if b.shape[1]:
             self._solver.solve(b, x)
-            self._has_work_space = not b.is_cuda
-            self._has_work_space = True
+            if self._release is None and not b.is_cuda:
+                self._release = weakref.finalize(self, _release_work_space, self._solver, len(b))
         return x
 
     def transposed(self) -> CholeskyFactor:
         """Itself: A is symmetric."""
         return self
-
-    def __del__(self) -> None:
-        # cholespy frees its work space when the number of columns changes, but not at the end;
-        # where there is none to free, that call would crash.
-        if getattr(self, "_has_work_space", False):
-            nothing = torch.empty(self.shape[0], 0, dtype=torch.float64, device=self._device)
-            self._solver.solve(nothing, torch.empty_like(nothing))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return CholeskyFactor, self._recipe
@@ -109,3 +103,13 @@ class BlockDiagonal(Matrix):
     def transposed(self) -> BlockDiagonal:
         """Aᵀ."""
         return BlockDiagonal([block.transposed() for block in self._blocks])
+
+
+def _release_work_space(solver: Any, n: int) -> None:
+    """Make cholespy free the work space of its last solve, as it does not when it is dropped.
+
+    It frees it when the next right-hand side has another width; one of width 0 needs none itself.
+    (Without a solve before, that call would crash.)
+    """
+    nothing = torch.empty(n, 0, dtype=torch.float64)
+    solver.solve(nothing, torch.empty_like(nothing))

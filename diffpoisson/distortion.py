@@ -16,6 +16,8 @@ which tends to det J for det J ≫ ε and keeps pushing a flipped face towards d
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -68,7 +70,8 @@ def symmetric_dirichlet(J: Jacobian, epsilon: float = 0.0) -> Density:
 
 def arap(J: Jacobian) -> Density:
     """As-rigid-as-possible, Σ (σᵢ - 1)² = min over rotations Q of ‖J - Q‖² (Liu et al. 2008)."""
-    return _squared_norm(J) - 2 * _sum_and_difference(J)[0] + 2
+    total, _ = _sum_and_difference(J)
+    return _squared_norm(J) - 2 * total + 2
 
 
 def lscm(J: Jacobian) -> Density:
@@ -99,6 +102,8 @@ def isometric_amips(
 ) -> Density:
     """Isometric advanced MIPS, exp(s (α mips + (1 - α) area) / 2) (Fu et al. 2015, eq. 9).
 
+    +∞ with zero gradient also where it exceeds the range of the dtype, as it soon does at flips.
+
     Args:
         J: (…, c, 2) Jacobians.
         epsilon: regularisation, see the module's text.
@@ -106,7 +111,9 @@ def isometric_amips(
         conformal: α, the weight of angles against areas.
     """
     mean = conformal * mips(J, epsilon) + (1 - conformal) * area_distortion(J, epsilon)
-    return torch.exp(exponent / 2 * mean)
+    log_energy = exponent / 2 * mean
+    finite = log_energy < math.log(torch.finfo(J.dtype).max)
+    return torch.where(finite, torch.where(finite, log_energy, 0).exp(), torch.inf)
 
 
 # -------------------------------------------------------------------- closed forms
@@ -155,12 +162,13 @@ def _sqrt(x: Tensor) -> Tensor:
 
 
 def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:
-    """det J itself for ε = 0, else χ(det J)."""
+    """χ(det J); for ε = 0 det J itself, and +∞ (a constant) where it is not positive."""
     if epsilon < 0:
         raise ValueError(f"distortion: epsilon must not be negative, got {epsilon}")
     det = determinant(J)
     if epsilon == 0:
-        return det
+        # Infinity keeps the denominators it ends up in, and their derivatives, free of 0/0.
+        return torch.where(det > 0, det, torch.inf)
     root = (det.square() + epsilon**2).sqrt()
     # For det < 0 the sum cancels; multiply by its conjugate instead.
     inverted = det < 0
@@ -169,4 +177,4 @@ def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:
 
 def _guard(energy: Tensor, chi: Tensor) -> Tensor:
     """+∞ with zero gradient where the determinant is not positive."""
-    return torch.where(chi > 0, energy, torch.inf)
+    return torch.where(chi < torch.inf, energy, torch.inf)

@@ -49,12 +49,15 @@ def laplacian_eigenpairs(
 
     Raises:
         MeshError: the mesh has fewer than k vertices.
+        ValueError: the solver is another mesh's.
     """
     n, zeros = mesh.n_vertices, mesh.n_components
     if not 1 <= n_eigenpairs <= n:
         raise MeshError(
             f"laplacian_eigenpairs: a mesh of {n} vertices has {n} eigenpairs, not {n_eigenpairs}"
         )
+    if solver is not None and solver.mesh is not mesh:
+        raise ValueError("laplacian_eigenpairs: the solver belongs to another mesh; pass its own")
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
     wanted = n_eigenpairs - zeros
     # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.

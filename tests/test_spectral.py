@@ -1,0 +1,299 @@
+"""Eigenpairs against dense and libigl references; signatures against their formulas in NumPy."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+
+import igl
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+import trimesh
+
+import diffpoisson as dp
+from tests import meshes, references
+from tests.checks import SOLVE, assert_near
+
+LANCZOS = 8  # eigenpairs that every mesh here is large enough to get from Lanczos
+
+
+@cache
+def large(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Meshes of about a hundred vertices."""
+    builders = {
+        "disk": lambda: meshes.disk(size=11),
+        "sphere": lambda: meshes.sphere(subdivisions=2),
+        "torus": lambda: meshes.torus(around=14, across=9),
+        "moebius": lambda: meshes.moebius(around=40),
+        "planar_disk": lambda: meshes.planar_disk(size=11),
+        "parts": lambda: meshes.union(meshes.disk(size=9), meshes.sphere(), meshes.torus()),
+        "twins": lambda: meshes.union(meshes.sphere(), meshes.sphere()),
+    }
+    return builders[name]()
+
+
+NAMES = ("disk", "sphere", "torus", "moebius", "planar_disk", "parts", "twins")
+shapes = pytest.mark.parametrize("name", NAMES)
+masses = pytest.mark.parametrize("mass", ["barycentric", "voronoi"])
+IGL_MASS = {
+    "barycentric": igl.MassMatrixType.MASSMATRIX_TYPE_BARYCENTRIC,
+    "voronoi": igl.MassMatrixType.MASSMATRIX_TYPE_VORONOI,
+}
+
+
+@cache
+def large_reference(name: str, mass: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return reference(*large(name), mass)
+
+
+def reference(vertices, faces, mass="barycentric") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All eigenvalues and eigenvectors of libigl's matrices by LAPACK, and the masses."""
+    padded = np.c_[vertices, np.zeros((len(vertices), 3 - vertices.shape[1]))]
+    M = igl.massmatrix(padded, faces, IGL_MASS[mass]).diagonal()
+    values, vectors = scipy.linalg.eigh(-igl.cotmatrix(vertices, faces).toarray(), np.diag(M))
+    return values, vectors, M
+
+
+# ------------------------------------------------------- eigenpairs
+
+
+@shapes
+@masses
+@pytest.mark.parametrize("k", [LANCZOS, 80])
+def test_eigenvalues_against_libigl_and_lapack(name, mass, k):
+    """By Lanczos and by the dense route, with repeated eigenvalues and several components."""
+    vertices, faces = large(name)
+    mesh = dp.Mesh(vertices, faces)
+    values, _ = dp.laplacian_eigenpairs(mesh, k, mass=mass)
+    expected = large_reference(name, mass)[0][:k]
+    zeros = mesh.n_components
+    assert (values[:zeros] == 0).all()
+    np.testing.assert_allclose(values[zeros:], expected[zeros:], rtol=SOLVE)
+
+
+@shapes
+@masses
+@pytest.mark.parametrize("k", [1, LANCZOS, 80])
+def test_eigenvectors_solve_the_problem(name, mass, k):
+    """Orthonormal in the mass, and with small residuals."""
+    vertices, faces = large(name)
+    values, vectors = (
+        x.numpy() for x in dp.laplacian_eigenpairs(dp.Mesh(vertices, faces), k, mass=mass)
+    )
+    M = large_reference(name, mass)[2]
+    np.testing.assert_allclose(vectors.T @ (M[:, None] * vectors), np.eye(k), rtol=0, atol=1e-10)
+    L = -igl.cotmatrix(vertices, faces)
+    residual = L @ vectors - M[:, None] * vectors * values
+    assert np.abs(residual).max() <= 1e-10 * np.abs(L).max() * np.abs(vectors).max()
+
+
+@pytest.mark.parametrize("name", ["triangle", "book", "bowtie", "annulus", "parts"])
+def test_all_eigenpairs_of_small_meshes(name):
+    vertices, faces = meshes.SPATIAL[name](0)
+    mesh, n = dp.Mesh(vertices, faces), len(vertices)
+    values, vectors = (x.numpy() for x in dp.laplacian_eigenpairs(mesh, n))
+    expected, _, M = reference(vertices, faces)
+    assert_near(values, expected, SOLVE)
+    np.testing.assert_allclose(vectors.T @ (M[:, None] * vectors), np.eye(n), rtol=0, atol=1e-10)
+
+
+def test_fewer_eigenpairs_than_components():
+    mesh = dp.Mesh(*meshes.parts())
+    values, vectors = dp.laplacian_eigenpairs(mesh, 2)
+    assert values.tolist() == [0, 0]
+    assert vectors.shape == (mesh.n_vertices, 2)
+
+
+def test_spectrum_of_the_sphere():
+    """l(l + 1), 2l + 1 times, with an error of order h²."""
+    errors = []
+    for subdivisions in (2, 3):
+        ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+        values, _ = dp.laplacian_eigenpairs(dp.Mesh(np.array(ball.vertices), ball.faces), 16)
+        expected = np.repeat([0, 2, 6, 12], [1, 3, 5, 7])
+        errors.append(np.abs(values.numpy() - expected)[1:].max() / 12)
+    assert errors[1] < 0.02
+    assert 3 < errors[0] / errors[1] < 5
+
+
+def test_spectrum_of_the_square():
+    """π²(i² + j²), natural boundary conditions."""
+    values, _ = dp.laplacian_eigenpairs(dp.Mesh(*meshes.planar_disk(size=33)), 6)
+    np.testing.assert_allclose(values / np.pi**2, [0, 1, 1, 2, 4, 4], rtol=5e-3, atol=1e-12)
+
+
+@shapes
+def test_supplied_solver(name):
+    """Of either gauge: only its factor is used."""
+    mesh = dp.Mesh(*large(name))
+    expected = dp.laplacian_eigenpairs(mesh, LANCZOS)
+    for gauge in ("mean", "vertex"):
+        solver = dp.PoissonSolver(mesh, gauge=gauge)
+        values, vectors = dp.laplacian_eigenpairs(mesh, LANCZOS, solver=solver)
+        assert torch.equal(values, expected[0])
+        assert torch.equal(vectors, expected[1])
+
+
+def test_concatenated_solver():
+    solvers = [dp.PoissonSolver(dp.Mesh(*large(name))) for name in ("disk", "torus")]
+    union = dp.PoissonSolver.concatenate(solvers)
+    values, _ = dp.laplacian_eigenpairs(union.mesh, LANCZOS, solver=union)
+    each = [dp.laplacian_eigenpairs(s.mesh, LANCZOS)[0] for s in solvers]
+    assert_near(values, torch.cat(each).sort().values[:LANCZOS], SOLVE)
+
+
+def test_single_precision_mesh():
+    vertices, faces = large("torus")
+    rounded = vertices.astype(np.float32)
+    values, vectors = dp.laplacian_eigenpairs(dp.Mesh(rounded, faces), LANCZOS)
+    assert values.dtype == vectors.dtype == torch.float32
+    expected, _ = dp.laplacian_eigenpairs(dp.Mesh(rounded.astype(float), faces), LANCZOS)
+    assert_near(values, expected, 1e-6)
+
+
+# ------------------------------------------------------- mass
+
+
+@shapes
+@masses
+def test_mass_against_libigl(name, mass):
+    vertices, faces = large(name)
+    actual = dp.lumped_mass(dp.Mesh(vertices, faces), mass)
+    assert_near(actual, large_reference(name, mass)[2], 1e-13)
+    assert actual.sum().item() == pytest.approx(references.areas(vertices, faces).sum(), rel=1e-13)
+
+
+@masses
+def test_mass_of_obtuse_triangles(mass):
+    vertices, faces = meshes.disk(3)
+    vertices = vertices * [3.0, 1, 1]
+    edges = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
+    angles = np.einsum("tid,tid->ti", edges, -np.roll(edges, -1, axis=1))
+    assert (angles < 0).any()
+    actual = dp.lumped_mass(dp.Mesh(vertices, faces), mass)
+    assert_near(actual, reference(vertices, faces, mass)[2], 1e-13)
+
+
+# ------------------------------------------------------- signatures
+
+
+def reference_wks(values, vectors, n_energies) -> np.ndarray:
+    """Aubry et al. 2011, written out over the non-zero eigenpairs."""
+    log = np.log(values)
+    delta = (log[-1] - log[0]) / n_energies
+    energies = np.linspace(log[0] + 2 * delta, log[-1] - 2 * delta, n_energies)
+    result = np.zeros((len(vectors), n_energies))
+    for column, e in enumerate(energies):
+        weights = [np.exp(-((e - x) ** 2) / (2 * (7 * delta) ** 2)) for x in log]
+        total = sum(w * vectors[:, i] ** 2 for i, w in enumerate(weights))
+        result[:, column] = total / sum(weights)
+    return result
+
+
+# Eigenvectors are unique up to sign where eigenvalues differ, as on these irregular meshes.
+IRREGULAR = ("disk", "sphere", "torus", "moebius", "planar_disk", "parts")
+
+
+@pytest.mark.parametrize("name", IRREGULAR)
+@masses
+def test_wave_kernel_signature_against_its_formula(name, mass):
+    vertices, faces = large(name)
+    mesh, k = dp.Mesh(vertices, faces), 20
+    values, vectors, M = large_reference(name, mass)
+    zeros = mesh.n_components
+    expected = reference_wks(values[zeros:k], vectors[:, zeros:k], 30)
+    actual = dp.wave_kernel_signature(mesh, 30, n_eigenpairs=k, mass=mass, scale_invariant=False)
+    assert_near(actual, expected, 1e-7)
+    dimensionless = dp.wave_kernel_signature(mesh, 30, n_eigenpairs=k, mass=mass)
+    assert_near(dimensionless, expected * M.sum(), 1e-7)
+
+
+def test_wave_kernel_signature_defaults():
+    """The paper's 50 energies from 50 eigenpairs; the area-weighted mean over the mesh is one."""
+    mesh = dp.Mesh(*large("sphere"))
+    signature = dp.wave_kernel_signature(mesh)
+    assert signature.shape == (mesh.n_vertices, 50)
+    means = mesh.vertex_areas @ signature / mesh.areas.sum()
+    np.testing.assert_allclose(means, np.ones(50), rtol=1e-9)
+
+
+@pytest.mark.parametrize("k", [20, 100])
+def test_wave_kernel_signature_invariance(k):
+    """Rigid motion, scale and renumbering; by Lanczos and by the dense route."""
+    vertices, faces = large("torus")
+    rng = np.random.default_rng(0)
+    new_vertices, new_faces, p, _ = meshes.renumbered(rng, vertices, faces)
+    moved = 1e3 * (new_vertices + rng.standard_normal(3)) @ meshes.rotation(rng, vertices).T
+    expected, actual = (
+        dp.wave_kernel_signature(dp.Mesh(*mesh), n_eigenpairs=k)
+        for mesh in ((vertices, faces), (moved, new_faces))
+    )
+    assert_near(actual, expected[p], 1e-7)
+    lengths, times = (
+        dp.wave_kernel_signature(dp.Mesh(*mesh), n_eigenpairs=k, scale_invariant=False)
+        for mesh in ((vertices, faces), (moved, new_faces))
+    )
+    assert_near(times * 1e6, lengths[p], 1e-7)
+
+
+@pytest.mark.parametrize("name", IRREGULAR)
+def test_heat_kernel_signature_against_its_formula(name):
+    vertices, faces = large(name)
+    values, vectors, _ = large_reference(name, "barycentric")
+    times = torch.tensor([1e-3, 0.1, 1.0], dtype=torch.float64)
+    expected = sum(
+        vectors[:, [i]] ** 2 * np.exp(-values[i] * times.numpy()[None]) for i in range(20)
+    )
+    actual = dp.heat_kernel_signature(dp.Mesh(vertices, faces), times, n_eigenpairs=20)
+    assert_near(actual, expected, 1e-7)
+
+
+def test_heat_settles_to_one_over_the_area():
+    mesh = dp.Mesh(*large("parts"))
+    late = dp.heat_kernel_signature(mesh, torch.tensor([1e9], dtype=torch.float64))[:, 0]
+    labels = references.components(mesh.n_vertices, mesh.faces.numpy())
+    areas = np.bincount(labels, references.vertex_areas(*large("parts")))
+    assert_near(late, 1 / areas[labels], 1e-12)
+
+
+# ------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize("k", [0, -1, 26])
+def test_too_many_or_too_few_eigenpairs_raise(k):
+    message = f"laplacian_eigenpairs: a mesh of 25 vertices has 25 eigenpairs, not {k}"
+    with pytest.raises(dp.MeshError, match=message):
+        dp.laplacian_eigenpairs(dp.Mesh(*meshes.disk()), k)
+
+
+def test_unknown_mass_raises(unchecked):
+    with pytest.raises(ValueError, match="mass must be 'barycentric' or 'voronoi', got 'full'"):
+        dp.lumped_mass(dp.Mesh(*meshes.disk()), "full")
+
+
+def test_too_small_spectrum_raises():
+    message = "2 eigenpairs hold 0 non-zero ones on this mesh of 3 component(s)"
+    with pytest.raises(dp.MeshError, match=re.escape(message)):
+        dp.wave_kernel_signature(dp.Mesh(*meshes.parts()), n_eigenpairs=2)
+
+
+def test_solver_of_another_mesh_raises():
+    mesh, other = (dp.Mesh(*meshes.disk(seed)) for seed in (0, 1))
+    for function in (
+        lambda solver: dp.laplacian_eigenpairs(mesh, 5, solver=solver),
+        lambda solver: dp.wave_kernel_signature(mesh, n_eigenpairs=5, solver=solver),
+        lambda solver: dp.heat_kernel_signature(
+            mesh, torch.ones(1, dtype=torch.float64), n_eigenpairs=5, solver=solver
+        ),
+    ):
+        with pytest.raises(ValueError, match="solver belongs to another mesh"):
+            function(dp.PoissonSolver(other))
+
+
+def test_reproducible():
+    """Lanczos starts from a fixed vector."""
+    mesh = dp.Mesh(*large("disk"))
+    first, again = (dp.laplacian_eigenpairs(mesh, LANCZOS)[1] for _ in range(2))
+    assert torch.equal(first, again)

@@ -1,7 +1,7 @@
 """Closed-form geometry of single cells: triangles in the plane or in space, tetrahedra.
 
-Pure functions of the corners' positions (m, k, D), differentiable any number of times; d = k - 1 is the
-dimension of the cell. Everything is computed in float64.
+Pure functions of the corners' positions (m, k, D), differentiable any number of times; d = k - 1 is
+the dimension of the cell. Everything is computed in float64.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from torch import Tensor
 
 Corners = Float[Tensor, "m k D"]
 
-# The computed determinant of d edges of lengths |e| carries an absolute rounding error below c u Π|e|,
-# u the unit roundoff of float64: c = 8 for a cross product (two differences, two products and one
-# subtraction in each component), c = 16 for a triple product (one more product and sum, twice).
+# The computed determinant of d edges of lengths |e| carries an absolute rounding error below c u
+# Π|e|, u the unit roundoff of float64: c = 8 for a cross product (two differences, two products and
+# one subtraction in each component), c = 16 for a triple product (one more product and sum, twice).
 # A cell whose determinant is smaller cannot be told from a flat one in float64.
 _DETERMINANT_ROUNDOFF = {2: 8 * 2.0**-53, 3: 16 * 2.0**-53}
 _FACTORIAL = {2: 2.0, 3: 6.0}
@@ -30,8 +30,8 @@ def measures(corners: Corners) -> Float[Tensor, "m"]:
 def determinants(corners: Corners) -> Float[Tensor, "m *D"]:
     """d! times the signed measure of each cell, (m,); as a normal vector, (m, 3), in space.
 
-    Taken at the corner with the shortest edges: all corners agree, but there a sliver loses the fewest
-    digits to cancellation.
+    Taken at the corner with the shortest edges: all corners agree, but there a sliver loses the
+    fewest digits to cancellation.
     """
     return _determinant(_edges_at_best_corner(corners))
 
@@ -45,8 +45,10 @@ def degenerate(corners: Corners) -> Bool[Tensor, "m"]:
 
 
 def frames(corners: Corners) -> Float[Tensor, "m D d"]:
-    """Orthonormal basis of each cell's tangent space as columns: of a triangle in space, along its
-    first edge and across it, B₁ × B₂ = normal; otherwise the identity."""
+    """Orthonormal basis of each cell's tangent space, as columns.
+
+    Of a triangle in space: along its first edge and across it, B₁ × B₂ = normal. Else the identity.
+    """
     m, k, D = corners.shape
     if k - 1 == D:
         return torch.eye(D, dtype=corners.dtype, device=corners.device).expand(m, D, D)
@@ -60,8 +62,8 @@ def frames(corners: Corners) -> Float[Tensor, "m D d"]:
 def hat_gradients(corners: Corners, frames: Float[Tensor, "m D d"]) -> Float[Tensor, "m d k"]:
     """Gradient ∇λᵢ of each corner's hat function, in coordinates of the frames.
 
-    ∇λᵢ is the inward normal of the facet opposite to corner i, of the length of that facet over d! times
-    the cell's measure: 1 / height.
+    ∇λᵢ is the inward normal of the facet opposite to corner i, of the length of that facet over d!
+    times the cell's measure: 1 / height.
     """
     determinant = determinants(corners)
     if corners.shape[1] == 4:
@@ -100,7 +102,7 @@ def _determinant(edges: Float[Tensor, "m d D"]) -> Float[Tensor, "m *D"]:
 
 
 def _facet_normals(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3"]:
-    """Twice the area vector of the facet opposite to each corner, inward for positive tetrahedra."""
+    """Twice the area vector of the facet opposite to each corner, inward if positively oriented."""
     others = torch.tensor(_OTHERS[4], device=corners.device)
     a, b, c = corners[:, others].unbind(2)
     return -torch.linalg.cross(b - a, c - a)

@@ -1,9 +1,10 @@
-"""What fixes the solution of a Poisson problem: pins, handles, face weights, and the gauge of the rest."""
+"""What fixes the solution of a Poisson problem: pins, handles, face weights, and a gauge."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NoReturn
 
 import numpy as np
 import torch
@@ -20,8 +21,8 @@ Gauge = Literal["mean", "vertex"]
 class Constraints:
     """A validated set of constraints on maps of one mesh.
 
-    Components are those of the faces of positive weight. A component that holds a pin or a handle is
-    held; each other one floats, and is placed by the gauge.
+    Components are those of the faces of positive weight. A component that holds a pin or a handle
+    is held; each other one floats, and is placed by the gauge.
 
     Attributes:
         pins: (p,) vertices whose images are given.
@@ -31,8 +32,8 @@ class Constraints:
         free: (f,) vertices to solve for: neither pinned nor the anchor of a floating component.
         floating: (n,) for each vertex, the index of its floating component, or n_floating if held.
         n_floating: number of floating components.
-        mean_weights: (n,) float64 weights of the mean that the gauge sets to zero, summing to one over
-            each floating component and zero elsewhere; None if the anchors stay at zero.
+        gauge_mask: (n,) bool, the vertices whose mean the gauge sets to zero; None if it leaves the
+            anchors at zero.
     """
 
     pins: Int[Tensor, "p"]
@@ -42,12 +43,13 @@ class Constraints:
     free: Int[Tensor, "f"]
     floating: Int[Tensor, "n"]
     n_floating: int
-    mean_weights: Float[Tensor, "n"] | None
+    gauge_mask: Bool[Tensor, "n"] | None
 
     @classmethod
     def build(
         cls,
         mesh: Mesh,
+        *,
         gauge: Gauge | Bool[Tensor, "n"],
         pins: Int[Tensor, "p"] | None,
         handles: Int[Tensor, "h"] | None,
@@ -57,8 +59,10 @@ class Constraints:
         """Validate; see `PoissonSolver` for the arguments and what is raised."""
         pinned = _vertex_indices(mesh, "pins", pins)
         handled = _vertex_indices(mesh, "handles", handles)
-        if (both := _members(handled, pinned)).any():
-            _fail(f"{describe_indices(handled[both], 'vertex', 'vertices')} both pinned and handles")
+        if (both := torch.isin(handled, pinned)).any():
+            _fail(
+                f"{describe_indices(handled[both], 'vertex', 'vertices')} both pinned and handles"
+            )
         if len(pinned) == mesh.n_vertices:
             _fail("every vertex is pinned, so that there is nothing to solve for; release some")
         strengths = _strengths(mesh, handled, handle_weights)
@@ -74,12 +78,59 @@ class Constraints:
         solved = torch.ones(mesh.n_vertices, dtype=torch.bool, device=mesh.device)
         solved[pinned] = False
         solved[anchors] = False
-        means = _mean_weights(mesh, gauge, floating, n_floating)
+        mask = _gauge_mask(mesh, gauge, floating, n_floating)
         free = solved.nonzero()[:, 0]
-        return cls(pinned, handled, strengths, weights, free, floating, n_floating, means)
+        return cls(pinned, handled, strengths, weights, free, floating, n_floating, mask)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Constraints]) -> Constraints:
+        """The constraints of the disjoint union of the meshes."""
+        if len({part.gauge_mask is None for part in parts}) > 1:
+            raise ValueError(
+                "PoissonSolver.concatenate: either all solvers have the gauge 'vertex' or none"
+            )
+        starts = np.cumsum([0] + [len(part.floating) for part in parts]).tolist()
+        floats = np.cumsum([0] + [part.n_floating for part in parts]).tolist()
+        total = floats[-1]
+
+        def moved(name: str) -> Tensor:
+            pairs = zip(parts, starts, strict=False)
+            return torch.cat([getattr(part, name) + start for part, start in pairs])
+
+        def joined(name: str) -> Tensor:
+            return torch.cat([getattr(part, name) for part in parts])
+
+        floating = torch.cat(
+            [
+                torch.where(part.floating < part.n_floating, part.floating + first, total)
+                for part, first in zip(parts, floats, strict=False)
+            ]
+        )
+        return cls(
+            moved("pins"),
+            moved("handles"),
+            joined("handle_weights"),
+            joined("face_weights"),
+            moved("free"),
+            floating,
+            total,
+            None if parts[0].gauge_mask is None else joined("gauge_mask"),
+        )
+
+    def mean_weights(self, sizes: Float[Tensor, "n"]) -> Float[Tensor, "n"] | None:
+        """Weights of the mean that the gauge sets to zero, given the vertices' sizes.
+
+        They sum to one over each floating component and are zero elsewhere; None for no mean.
+        """
+        if self.gauge_mask is None:
+            return None
+        sizes = sizes * (self.gauge_mask & (self.floating < self.n_floating))
+        totals = sizes.new_zeros(self.n_floating + 1).index_add(0, self.floating, sizes)
+        shares = torch.cat([totals[:-1].reciprocal(), totals.new_zeros(1)])
+        return sizes * shares[self.floating]
 
 
-def _fail(message: str) -> None:
+def _fail(message: str) -> NoReturn:
     raise ValueError(f"PoissonSolver: {message}")
 
 
@@ -151,34 +202,29 @@ def _labels(mesh: Mesh, weights: Tensor, pins: Tensor) -> Int[Tensor, "n"]:
     return torch.from_numpy(labels).to(mesh.device)
 
 
-def _mean_weights(
+def _gauge_mask(
     mesh: Mesh, gauge: Gauge | Tensor, floating: Tensor, n_floating: int
-) -> Float[Tensor, "n"] | None:
-    if isinstance(gauge, str) and gauge == "vertex":
-        return None
-    sizes = mesh._double_vertex_measures
+) -> Bool[Tensor, "n"] | None:
     if isinstance(gauge, Tensor):
         if gauge.shape != (mesh.n_vertices,) or gauge.dtype != torch.bool:
             _fail(
                 f"a gauge mask must be (n={mesh.n_vertices},) bool, got {tuple(gauge.shape)} "
                 f"{gauge.dtype}"
             )
-        sizes = sizes * gauge
-    elif gauge != "mean":
+        present = torch.zeros(n_floating + 1, dtype=torch.bool, device=mesh.device)
+        present[floating[gauge]] = True
+        if not present[:-1].all():
+            empty = (~present[:-1]).nonzero()[:, 0]
+            culprits = describe_indices(empty, "component", "components")
+            _fail(f"the gauge mask has no vertex in floating {culprits}; add one, or pin it")
+        return gauge.clone()
+    if gauge not in ("mean", "vertex"):
         _fail(f"gauge must be 'mean', 'vertex' or a mask over the vertices, got {gauge!r}")
-    totals = sizes.new_zeros(n_floating + 1).index_add(0, floating, sizes)[:-1]
-    if not (totals > 0).all():
-        empty = describe_indices((totals == 0).nonzero()[:, 0], "component", "components")
-        _fail(f"the gauge mask has no vertex in floating {empty}; add one or pin the component")
-    shares = torch.cat([totals.reciprocal(), totals.new_zeros(1)])
-    return sizes * shares[floating]
+    everywhere = torch.ones(mesh.n_vertices, dtype=torch.bool, device=mesh.device)
+    return everywhere if gauge == "mean" else None
 
 
 def _first_of_each(labels: Tensor, count: int) -> Int[Tensor, "count"]:
     """Lowest index that carries each of the labels 0 … count - 1."""
     _, first = np.unique(labels.cpu().numpy(), return_index=True)
     return torch.from_numpy(first[:count]).to(labels.device)
-
-
-def _members(values: Tensor, of: Tensor) -> Bool[Tensor, "k"]:
-    return torch.isin(values, of)

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson import cells
@@ -168,65 +168,8 @@ def divergence(
     if vertices is not None:
         geometry = CellGeometry.at(mesh, vertices)
         intrinsic = as_intrinsic("divergence", mesh, R.double(), geometry.frames)
-        return geometry.divergence(mesh, intrinsic).to(R.dtype)
+        return geometry.divergence(intrinsic).to(R.dtype)
     R = as_intrinsic("divergence", mesh, R, mesh._double_frames)
-    operator, columns = gradient_operator(mesh), matrices_to_columns(R)
-    return columns_to_vertices(operator.adjoint(operator.weights.to(R.dtype) * columns), R.shape)
-
-
-def laplacian(self) -> sp.csr_matrix:
-        """L = ∇ᵀA∇ as a SciPy matrix (n, n)."""
-        return (self.divergence_matrix @ self.matrix).tocsr()
-
-
-_operators: WeakKeyDictionary[Mesh, GradientOperator] = WeakKeyDictionary()
-
-
-def gradient_operator(mesh: Mesh) -> GradientOperator:
-    """The mesh's operators, assembled at the first call and kept as long as the mesh lives."""
-    if mesh not in _operators:
-        _operators[mesh] = GradientOperator(mesh)
-    return _operators[mesh]
-
-
-def jacobians(
-    mesh: Mesh, phi: Float[Tensor, "*batch n c"], *, extrinsic: bool = False
-) -> Float[Tensor, "*batch m c d"]:
-    """Jacobian of a piecewise-linear map on each face (paper, eq. 2).
-
-    Args:
-        mesh: the domain.
-        phi: (…, n, c) float32 or float64 image of each vertex, c output coordinates.
-        extrinsic: return J Bᵀ, acting on ambient vectors (zero along the normal), instead of J.
-
-    Returns:
-        (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) if extrinsic; row = output
-        coordinate, column = tangent direction. Dimensionless if the image has the mesh's units.
-
-    Raises:
-        ValueError: phi does not have one row per vertex.
-    """
-    if phi.ndim < 2 or phi.shape[-2] != mesh.n_vertices:
-        raise ValueError(
-            f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
-        )
-    J = columns_to_matrices(gradient_operator(mesh).gradient(vertices_to_columns(phi)), phi.shape)
-    return extend(J, mesh._double_frames) if extrinsic else J
-
-
-def divergence(mesh: Mesh, R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "*batch n c"]:
-    """∇ᵀA R, the adjoint of the gradient in the area-weighted inner product.
-
-    This is the integrated divergence with the sign of an adjoint: ⟨∇ᵀA R, Φ⟩ = Σ |tⱼ| ⟨Rⱼ, (∇Φ)ⱼ⟩.
-
-    Args:
-        mesh: the domain.
-        R: (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) on ambient vectors.
-
-    Raises:
-        ValueError: R does not have one such matrix per face.
-    """
-    R = as_intrinsic("divergence", mesh, R)
     operator, columns = gradient_operator(mesh), matrices_to_columns(R)
     return columns_to_vertices(operator.adjoint(operator.weights.to(R.dtype) * columns), R.shape)
 
@@ -254,13 +197,13 @@ class CellGeometry(NamedTuple):
     """The gradient at given positions, cell by cell: differentiable in field and positions.
 
     Attributes:
-        faces: (m, k) the cells.
+        mesh: the cells, at whatever positions.
         hats: (m, d, k) hat gradients, in frame coordinates.
         frames: (m, D, d) tangent bases.
         measures: (m,) areas or volumes.
     """
 
-    faces: Int[Tensor, "m k"]
+    mesh: Mesh
     hats: Float[Tensor, "m d k"]
     frames: Float[Tensor, "m D d"]
     measures: Float[Tensor, "m"]
@@ -276,19 +219,25 @@ class CellGeometry(NamedTuple):
         corners = vertices.double()[mesh.faces]
         frames = cells.frames(corners)
         hats = cells.hat_gradients(corners, frames)
-        return cls(mesh.faces, hats, frames, cells.measures(corners))
+        return cls(mesh, hats, frames, cells.measures(corners))
 
     def gradient(self, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch m c d"]:
         """∇Φ on each cell."""
-        return (self.hats @ phi[..., self.faces, :]).mT
+        return (self.hats @ phi[..., self.mesh.faces, :]).mT
 
     def divergence(
-        self, mesh: Mesh, R: Float[Tensor, "*batch m c d"]
+        self, R: Float[Tensor, "*batch m c d"], weights: Float[Tensor, "m"] | None = None
     ) -> Float[Tensor, "*batch n c"]:
-        """∇ᵀA R at each vertex."""
-        at_corners = self.measures[:, None, None] * (R @ self.hats).mT  # (…, m, k, c)
-        zeros = at_corners.new_zeros(*R.shape[:-3], mesh.n_vertices, R.shape[-2])
-        return zeros.index_add(-2, self.faces.flatten(), at_corners.flatten(-3, -2))
+        """∇ᵀA R at each vertex, with the weights, if any, in A."""
+        A = self.measures if weights is None else self.measures * weights
+        at_corners = A[:, None, None] * (R @ self.hats).mT  # (…, m, k, c)
+        zeros = at_corners.new_zeros(*R.shape[:-3], self.mesh.n_vertices, R.shape[-2])
+        return zeros.index_add(-2, self.mesh.faces.flatten(), at_corners.flatten(-3, -2))
+
+    def vertex_measures(self) -> Float[Tensor, "n"]:
+        """An equal share of the measure of each cell around a vertex."""
+        shares = self.measures[:, None] / self.mesh.faces.shape[1]
+        return self.mesh.sum_at_vertices(shares)[:, 0]
 
 
 # ------------------------------------------------------- fields as columns, for sparse products

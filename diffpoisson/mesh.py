@@ -15,6 +15,7 @@ from diffpoisson import cells, topology
 
 ArrayLike = Tensor | np.ndarray
 
+
 class MeshError(ValueError):
     """The arrays do not describe a usable mesh; the message names the culprits and the remedy."""
 
@@ -31,6 +32,18 @@ class CleanedMesh(NamedTuple):
     mesh: Mesh
     vertex_map: Tensor
     face_map: Tensor
+
+
+# Cached properties of a mesh that do not depend on its vertices.
+_OF_FACES = (
+    "components",
+    "euler_characteristic",
+    "is_manifold",
+    "boundary_loops",
+    "is_disk",
+    "part_of_vertex",
+    "part_of_face",
+)
 
 
 class Mesh:
@@ -120,6 +133,25 @@ class Mesh:
     def device(self) -> torch.device:
         """Device of the vertices and of every derived quantity."""
         return self.vertices.device
+
+    def with_vertices(self, vertices: Tensor) -> Mesh:
+        """The same faces at other positions; what depends on the faces alone is kept.
+
+        Raises:
+            MeshError: as for a new mesh, or another shape, dtype or device than before.
+        """
+        before = (self.vertices.shape, self.dtype, self.device)
+        if (vertices.shape, vertices.dtype, vertices.device) != before:
+            raise MeshError(
+                f"Mesh.with_vertices: expected {tuple(self.vertices.shape)} {self.dtype} on "
+                f"{self.device}, got {tuple(vertices.shape)} {vertices.dtype} on {vertices.device}"
+            )
+        _validate(vertices, self.faces)
+        moved = object.__new__(Mesh)
+        moved._assign(vertices.clone(), self.faces, self.vertex_offsets, self.face_offsets)
+        kept = {name: self.__dict__[name] for name in _OF_FACES if name in self.__dict__}
+        moved.__dict__.update(kept)
+        return moved
 
     def to(self, target: torch.dtype | torch.device | str) -> Mesh:
         """The same mesh in another floating dtype or on another device."""
@@ -265,12 +297,14 @@ class Mesh:
             if len(np.unique(ends)) < len(ends):
                 vertex = np.flatnonzero(np.bincount(ends) > 1)
                 raise MeshError(
-                    f"boundary_loops: the boundary passes {_some(vertex, 'vertex', 'vertices')} "
-                    "more than once; split such vertices, and orient the faces consistently"
+                    "boundary_loops: the boundary passes "
+                    f"{describe_indices(vertex, 'vertex', 'vertices')} more than once; split such "
+                    "vertices, and orient the faces consistently"
                 )
         if (open_ends := np.setxor1d(tails, heads)).size:
             raise MeshError(
-                f"boundary_loops: the boundary ends at {_some(open_ends, 'vertex', 'vertices')}, "
+                "boundary_loops: the boundary ends at "
+                f"{describe_indices(open_ends, 'vertex', 'vertices')}, "
                 "on an edge of three or more faces; split such edges"
             )
         return [torch.from_numpy(loop).to(self.device) for loop in topology.cycles(tails, heads)]
@@ -409,8 +443,9 @@ def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
         )
     if vertices.requires_grad:
         raise MeshError(
-            "Mesh: vertices require grad, but operators are constant in the geometry, so its "
-            "gradient would silently be zero; pass vertices.detach()"
+            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
+            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
+            "the solver"
         )
     if faces.ndim != 2 or faces.shape[1] not in (3, 4):
         raise MeshError(
@@ -463,13 +498,15 @@ def _measure(faces: Tensor) -> str:
 
 def _reject(bad: Bool[Tensor, "k"], what: str, noun: tuple[str, str] = ("face", "faces")) -> None:
     if bad.any():
-        culprits = _some(bad.nonzero()[:, 0].cpu().numpy(), *noun)
+        culprits = describe_indices(bad.nonzero()[:, 0], *noun)
         raise MeshError(f"Mesh: {culprits} {what}; Mesh.cleaned(vertices, faces) drops them")
 
 
-def _some(indices: np.ndarray, singular: str, plural: str, show: int = 5) -> str:
+def describe_indices(
+    indices: np.ndarray | Tensor, singular: str, plural: str, show: int = 5
+) -> str:
     """'3 faces [7, 8, 12]', shortened after the first few indices."""
-    listed = ", ".join(map(str, indices[:show])) + (", …" if len(indices) > show else "")
+    listed = ", ".join(map(str, indices[:show].tolist())) + (", …" if len(indices) > show else "")
     return f"{len(indices)} {singular if len(indices) == 1 else plural} [{listed}]"
 
 

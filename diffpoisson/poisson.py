@@ -2,18 +2,19 @@
 
     Φ = argmin Σⱼ wⱼ|tⱼ| ‖(∇Φ)ⱼ - Rⱼ‖² + Σₕ aₕ ‖Φₕ - qₕ‖²   subject to Φₚ = qₚ at pins
 
-with face weights w (all one in the paper), soft handles h of strength a, and pins p. Its normal equations
-are (L + W) Φ = ∇ᵀA R + W q, L = ∇ᵀA∇. Pinned rows are eliminated; a connected component with neither pin
-nor handle is determined up to a translation, so one vertex of it, its anchor, is eliminated too, and the
-gauge fixes the translation. What remains is positive definite, and factorised once.
+with face weights w (all one in the paper), soft handles h of strength a, and pins p. Its normal
+equations are (L + W) Φ = ∇ᵀA R + W q, L = ∇ᵀA∇. Pinned rows are eliminated; a connected component
+with neither pin nor handle is determined up to a translation, so one vertex of it, its anchor, is
+eliminated too, and the gauge fixes the translation. What remains is positive definite, and
+factorised once.
 
-Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For positions v
-with the same values that require grad, k steps of refinement
+Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For
+positions v with the same values that require grad, k steps of refinement
 
     Φ ← Φ + F⁻¹ (b(v) - L(v) Φ)
 
-change no value, but make the result's derivatives by v exact up to order k: each step turns an error of
-order j in a perturbation of v into one of order j + 1.
+change no value, but make the result's derivatives by v exact up to order k: each step turns an
+error of order j in a perturbation of v into one of order j + 1.
 """
 
 from __future__ import annotations
@@ -47,23 +48,24 @@ class PoissonSolver:
 
     Args:
         mesh: the domain; any number of components.
-        gauge: what fixes the translation of each component that holds no pin or handle: `"mean"`, its
-            area-weighted mean is zero; `"vertex"`, its vertex of lowest index maps to zero; or a
-            (n,) mask, the area-weighted mean of its masked vertices is zero.
+        gauge: what fixes the translation of each component that holds no pin or handle: `"mean"`,
+            its area-weighted mean is zero; `"vertex"`, its vertex of lowest index maps to zero; or
+            a (n,) mask, the area-weighted mean of its masked vertices is zero.
         pins: (p,) indices of vertices whose images will be given, or a (n,) mask.
         handles: (h,) indices of vertices that will be attracted to given points, or a (n,) mask.
-        handle_weights: strength of all or of each handle, against faces that count by their area; in
-            the unit of the measures over the square of the unit of the map.
-        face_weights: (m,) non-negative factor on the area of each face; zero leaves it out of the fit.
+        handle_weights: strength of all or of each handle, against faces that count by their area;
+            in the unit of the measures over the square of the unit of the map.
+        face_weights: (m,) non-negative factor on the area of each face; zero leaves it out of the
+            fit.
 
     Attributes:
         mesh: the domain.
         constraints: the validated constraints.
 
     Raises:
-        ValueError: indices out of range, named twice, or both pinned and handles; every vertex pinned;
-            weights that are negative or not finite; a vertex that only faces of weight zero touch; a
-            gauge mask that misses a component.
+        ValueError: indices out of range, named twice, or both pinned and handles; every vertex
+            pinned; weights that are negative or not finite; a vertex that only faces of weight zero
+            touch; a gauge mask that misses a component.
     """
 
     def __init__(
@@ -76,16 +78,14 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
-        self._options = {
+        self._options: dict[str, Any] = {
             "gauge": gauge,
             "pins": pins,
             "handles": handles,
             "handle_weights": handle_weights,
             "face_weights": face_weights,
         }
-        constraints = Constraints.build(
-            mesh, gauge, pins, handles, handle_weights, face_weights
-        )
+        constraints = Constraints.build(mesh, **self._options)
         free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
         divergence, L = _assemble(mesh, constraints)
         factor = CholeskyFactor(L[free][:, free], mesh.device)
@@ -110,6 +110,7 @@ class PoissonSolver:
         self._handle_rows = free_index[constraints.handles]
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
+        self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
 
     @property
     def n_floating(self) -> int:
@@ -172,16 +173,17 @@ class PoissonSolver:
                 instead of zero.
             transforms: (…, m, c, c) matrices that multiply those of R from the left.
             vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
-            face_weights: (m,) the solver's own face weights again, if derivatives by them are wanted.
-            order: up to which order derivatives by `vertices` and `face_weights` are exact; each order
-                costs one more solve. Higher derivatives are wrong, so do not take them.
+            face_weights: (m,) the solver's own face weights again, if derivatives by them are
+                wanted.
+            order: up to which order derivatives by `vertices` and `face_weights` are exact; each
+                order costs one more solve. Higher derivatives are wrong, so do not take them.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
 
         Raises:
-            ValueError: shapes that do not fit; images missing for pins or handles, or given without;
-                `vertices` or `face_weights` that differ from those that were factorised.
+            ValueError: shapes that do not fit; images missing for pins or handles, or given
+                without; `vertices` or `face_weights` that differ from those that were factorised.
         """
         geometry = self._moving_geometry(vertices, face_weights, order)
         frames = self._frames if geometry is None else geometry.frames
@@ -196,11 +198,13 @@ class PoissonSolver:
 
         b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
         phi = self._scattered(self._inverse(b.index_add(0, self._handle_rows, pull)), q_pins)
-        for _ in range(order if geometry is not None else 0):
-            residual = self._residual(geometry, phi, intrinsic, pull)
-            phi = phi.index_add(0, constraints.free, self._inverse(residual))
-        sizes = None if geometry is None else geometry.vertex_measures(self.mesh.n_vertices)
-        phi = self._placed(phi, sizes, translations, batch, c)
+        means = self._mean_weights
+        if geometry is not None:
+            for _ in range(order):
+                residual = self._residual(geometry, face_weights, phi, intrinsic, pull)
+                phi = phi.index_add(0, constraints.free, self._inverse(residual))
+            means = constraints.mean_weights(geometry.vertex_measures())
+        phi = self._placed(phi, means, translations, batch, c)
         return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
     def solve_laplacian(self, b: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -245,7 +249,7 @@ class PoissonSolver:
     def _placed(
         self,
         phi: Float[Tensor, "n k"],
-        sizes: Float[Tensor, "n"] | None,
+        means: Float[Tensor, "n"] | None,
         translations: Tensor | None,
         batch: torch.Size,
         c: int,
@@ -253,9 +257,8 @@ class PoissonSolver:
         """Move each floating component to where its gauge wants it."""
         constraints = self.constraints
         shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
-        weights = constraints.means_with(sizes)
-        if weights is not None:
-            shifts = shifts.index_add(0, constraints.floating, -weights[:, None] * phi)
+        if means is not None:
+            shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
         if translations is not None:
             q = self._given("floating components", translations, self.n_floating, batch, c)
             shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
@@ -281,17 +284,21 @@ class PoissonSolver:
                     f"PoissonSolver: {name} differ from those that were factorised; solve with "
                     "solver.update(vertices), or with a solver of these weights",
                 )
-        geometry = CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
-        weights = own[1] if face_weights is None else face_weights.double()
-        return geometry.weighted(weights)
+        return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
 
     def _residual(
-        self, geometry: CellGeometry, phi: Tensor, R: Tensor, pull: Tensor
+        self,
+        geometry: CellGeometry,
+        face_weights: Tensor | None,
+        phi: Float[Tensor, "n k"],
+        R: Float[Tensor, "*batch m c d"],
+        pull: Float[Tensor, "h k"],
     ) -> Float[Tensor, "f k"]:
         """b(v) - (L(v) + W) Φ at the free vertices."""
         constraints = self.constraints
-        map_ = columns_to_vertices(phi, R.shape)
-        fit = vertices_to_columns(geometry.divergence(R - geometry.gradient(map_)))
+        weights = constraints.face_weights if face_weights is None else face_weights.double()
+        misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
+        fit = vertices_to_columns(geometry.divergence(misfit, weights))
         held = constraints.handle_weights[:, None] * phi[constraints.handles]
         return fit.index_add(0, constraints.handles, pull - held)[constraints.free]
 

@@ -18,7 +18,7 @@ def undirected_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def component_labels(cells: np.ndarray, n_vertices: int) -> np.ndarray:
-    """Label of each vertex's connected component; cells (m, k) that share a vertex are connected."""
+    """Component of each vertex; cells (m, k) that share a vertex are connected."""
     links = cells[:, :-1].ravel(), cells[:, 1:].ravel()
     graph = sp.coo_matrix((np.ones(len(links[0])), links), shape=(n_vertices,) * 2)
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)

@@ -488,14 +488,17 @@ def table() -> str:
         name: sum(map(bool, column))
         for name, column in zip(CHECKS, zip(*rows.values(), strict=True), strict=True)
     }
+    assert min(caught.values()) > 0
     lines = [
         "# What the tests would notice",
         "",
         f"{len(FAULTS)} mistakes, put one at a time into the real layer (`tests/faults.py`),",
         f"against {len(CHECKS)} checks (`tests/checks.py`). ✗ marks a check that fails, ! one that",
-        "crashes. Every mistake is noticed. The customary round trip through the layer's own",
-        f"gradient notices {caught['round_trip']}. Written by `python -m tests.faults`;",
-        "`tests/test_faults.py` asserts for each mistake that a named check fails.",
+        "crashes. Every mistake is noticed, and every check notices some. The customary round trip",
+        f"through the layer's own gradient notices {caught['round_trip']}.",
+        "",
+        "Written by `python -m tests.faults`; `tests/test_faults.py` asserts for each mistake that a",
+        "named check fails.",
         "",
         *(f"{i}. {_words(name)}" for i, name in enumerate(CHECKS, 1)),
         "",

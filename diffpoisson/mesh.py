@@ -473,7 +473,7 @@ def _validate(vertices: Tensor, faces: Tensor) -> None:
     used = torch.zeros(n, dtype=torch.bool, device=vertices.device)
     used[faces.flatten()] = True
     _reject(~used, "that no face uses", ("vertex", "vertices"))
-    _reject(cells.degenerate(vertices.double()[faces]), f"of zero {_measure(faces)}")
+    _reject(cells.degenerate(vertices.double()[faces]), _flat(faces))
     _check_range(vertices, faces)
 
 
@@ -494,6 +494,11 @@ def _check_range(vertices: Tensor, faces: Tensor) -> None:
 
 def _measure(faces: Tensor) -> str:
     return "area" if faces.shape[1] == 3 else "volume"
+
+
+def _flat(faces: Tensor) -> str:
+    quads = " (faces of four vertices are tetrahedra; triangulate quads)"
+    return f"of zero {_measure(faces)}" + (quads if faces.shape[1] == 4 else "")
 
 
 def _reject(bad: Bool[Tensor, "k"], what: str, noun: tuple[str, str] = ("face", "faces")) -> None:

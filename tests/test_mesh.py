@@ -121,6 +121,15 @@ def test_valid_at_any_scale_and_aspect(mesh):
     assert (built.areas > 0).all()
 
 
+@pytest.mark.parametrize("height", [1e-6, 1e-10, 1e-14])
+def test_thin_triangles_are_kept(height):
+    """Only what float64 cannot tell from a segment has zero area."""
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, height, 0]])
+    mesh = dp.Mesh(vertices, np.array([[0, 1, 2]]))
+    assert mesh.areas.item() == pytest.approx(height / 2, rel=1e-14, abs=0)
+    assert dp.Mesh.cleaned(vertices, mesh.faces.numpy()).mesh.n_faces == 1
+
+
 # ------------------------------------------------------- cleaning
 
 
@@ -223,7 +232,9 @@ def test_needle_areas_do_not_cancel():
     """A needle of width 1e-9 whose thin corner comes first: the long edges' product cancels."""
     vertices = np.array([[0.0, 0, 0], [1, 1, 0], [1, 1 + 1e-9, 0]])
     width = (1 + 1e-9) - 1  # as stored
-    assert dp.Mesh(vertices, np.array([[0, 1, 2]])).areas.item() == pytest.approx(width / 2, 1e-14)
+    assert dp.Mesh(vertices, np.array([[0, 1, 2]])).areas.item() == pytest.approx(
+        width / 2, rel=1e-14, abs=0
+    )
 
 
 @pytest.mark.parametrize("name", TOPOLOGIES)
@@ -330,6 +341,13 @@ def pinched() -> tuple[np.ndarray, np.ndarray]:
 def test_boundary_that_is_no_cycle_raises(build):
     with pytest.raises(dp.MeshError, match="boundary_loops: the boundary"):
         _ = dp.Mesh(*build()).boundary_loops
+
+
+def test_edge_of_four_faces_is_no_boundary():
+    """Two closed tetrahedra that share an edge."""
+    vertices = np.r_[V, [[2.0, -1, 0], [2.0, -1, 1]]]
+    second = np.array([0, 1, 4, 5])[F]
+    assert dp.Mesh(vertices, np.r_[F, second]).boundary_loops == []
 
 
 def test_boundary_of_inconsistent_faces_raises():

@@ -1,17 +1,17 @@
-"""Distortion of a map, from the closed-form singular values of its Jacobians.
+"""Distortion of a map, from closed forms of its Jacobians' singular values.
 
-All functions take J of shape (…, c, 2), c = 2 for maps to the plane and c = 3 for maps to space,
-and return one density per face, (…); weigh by `mesh.areas` to integrate. Nothing here calls an SVD,
-whose gradients are not finite at repeated singular values (every isometry).
+All functions take Jacobians J of shape (…, c, d), maps of surfaces to the plane (2, 2) or to space
+(3, 2) or of volumes (3, 3), and return one density per cell, (…); weigh by `mesh.measures` to
+integrate.
 
-A map to the plane has *signed* singular values σ₁ ≥ |σ₂| with sign(σ₂) = sign(det J): a negative σ₂
-is a flipped face. Energies that punish collapse (symmetric Dirichlet, MIPS, AMIPS, area) are
-infinite, with zero gradient, where det J ≤ 0. To optimise through flips, their ε > 0 replaces det J
-in denominators by
+Between spaces of equal dimension singular values are *signed*, σ₁ ≥ … ≥ |σ_d| with sign(σ_d) =
+sign(det J): a negative σ_d is a flipped cell. Energies that punish collapse (symmetric Dirichlet,
+MIPS, AMIPS, area) are infinite, with zero gradient, where det J ≤ 0. To optimise through flips,
+their ε > 0 replaces det J in denominators by
 
     χ(det J) = (det J + √(ε² + det² J)) / 2 > 0            (Garanzha et al. 2021, eq. 4)
 
-which tends to det J for det J ≫ ε and keeps pushing a flipped face towards det J > 0.
+which tends to det J for det J ≫ ε and keeps pushing a flipped cell towards det J > 0.
 """
 
 from __future__ import annotations
@@ -22,74 +22,92 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-Jacobian = Float[Tensor, "*batch c 2"]
+Jacobian = Float[Tensor, "*batch c d"]
 Density = Float[Tensor, "*batch"]
 
 
-def singular_values(J: Jacobian) -> Float[Tensor, "*batch 2"]:
-    """Signed singular values (σ₁, σ₂): σ₁ ≥ |σ₂|, and sign(σ₂) = sign(det J) for maps to the plane.
+def singular_values(J: Jacobian) -> Float[Tensor, "*batch d"]:
+    """Signed singular values, descending; the last has the sign of det J if J is square.
 
-    Gradients are finite everywhere; at a repeated value, where none exists, they are the
-    subgradient that treats both directions alike.
+    First derivatives are finite everywhere; at a repeated value, where none exists, they are a
+    subgradient.
 
     Raises:
-        ValueError: J is not (…, 2, 2) or (…, 3, 2).
+        ValueError: J is not (…, 2, 2), (…, 3, 2) or (…, 3, 3).
     """
+    if _shape(J) == (3, 3):
+        magnitudes = torch.linalg.svdvals(J)
+        sign = torch.where(determinant(J) < 0, -1, 1).to(J)
+        return torch.cat([magnitudes[..., :2], sign[..., None] * magnitudes[..., 2:]], dim=-1)
     total, difference = _sum_and_difference(J)
     return torch.stack([total + difference, total - difference], dim=-1) / 2
 
 
 def determinant(J: Jacobian) -> Density:
-    """det J = σ₁σ₂, the area ratio: signed for maps to the plane, positive for maps to space."""
-    _check(J)
+    """det J, the ratio of measures: signed if J is square, positive for surfaces in space."""
+    shape = _shape(J)
+    if shape == (3, 3):
+        return (torch.linalg.cross(J[..., 0], J[..., 1]) * J[..., 2]).sum(-1)
     u, v = J.unbind(-1)
-    if J.shape[-2] == 2:
+    if shape == (2, 2):
         return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
     return torch.linalg.vector_norm(torch.linalg.cross(u, v), dim=-1)
 
 
 def flipped(J: Jacobian) -> Bool[Tensor, "*batch"]:
-    """Whether each face is flipped or collapsed, det J ≤ 0 (the paper's #I counts them)."""
+    """Whether each cell is flipped or collapsed, det J ≤ 0 (the paper's #I counts them)."""
     return determinant(J) <= 0
 
 
 def isometric_distortion(J: Jacobian) -> Density:
-    """D = max(σ₁, 1/σ₂), 1 at an isometry, +∞ at a flip (the paper counts D > 10)."""
-    largest, smallest = singular_values(J).unbind(-1)
+    """D = max(σ₁, 1/σ_d), 1 at an isometry, +∞ at a flip (the paper counts D > 10)."""
+    largest, *_, smallest = singular_values(J).unbind(-1)
     return torch.where(smallest > 0, torch.maximum(largest, smallest.reciprocal()), torch.inf)
 
 
 def symmetric_dirichlet(J: Jacobian, epsilon: float = 0.0) -> Density:
-    """‖J‖² + ‖J⁻¹‖² = Σ σᵢ² + σᵢ⁻², 4 at an isometry (Smith and Schaefer 2015).
+    """‖J‖² + ‖J⁻¹‖² = Σ σᵢ² + σᵢ⁻², 2d at an isometry (Smith and Schaefer 2015).
 
-    Regularised: ‖J‖² (1 + 1/χ²).
+    Regularised: ‖J‖² + ‖cof J‖² / χ².
     """
     chi = _positive_determinant(J, epsilon)
-    return _guard(_squared_norm(J) * (1 + chi**-2), chi)
+    return _guard(_squared_norm(J) + _squared_cofactors(J) * chi**-2, chi)
 
 
 def arap(J: Jacobian) -> Density:
     """As-rigid-as-possible, Σ (σᵢ - 1)² = min over rotations Q of ‖J - Q‖² (Liu et al. 2008)."""
+    if _shape(J) == (3, 3):
+        return (singular_values(J) - 1).square().sum(-1)
     total, _ = _sum_and_difference(J)
     return _squared_norm(J) - 2 * total + 2
 
 
 def lscm(J: Jacobian) -> Density:
-    """Conformal energy, (σ₁ - σ₂)² / 2, 0 at an unflipped similarity (Lévy et al. 2002)."""
-    _check(J)
+    """Conformal energy, (σ₁ - σ₂)² / 2, 0 at an unflipped similarity (Lévy et al. 2002).
+
+    Raises:
+        ValueError: J is not of a surface, (…, 2, 2) or (…, 3, 2).
+    """
+    if _shape(J) == (3, 3):
+        raise ValueError("lscm: defined for maps of surfaces only; use mips for volumes")
     if J.shape[-2] == 2:
         return _similarity_parts(J)[1].square().sum(-1) / 2
     return _sum_and_difference(J)[1].square() / 2
 
 
 def mips(J: Jacobian, epsilon: float = 0.0) -> Density:
-    """MIPS, σ₁/σ₂ + σ₂/σ₁, 2 at a similarity (Hormann and Greiner 2000)."""
+    """MIPS, 2 at a similarity: σ₁/σ₂ + σ₂/σ₁ = ‖J‖² / det J (Hormann and Greiner 2000).
+
+    Of volumes, (‖J‖²‖J⁻¹‖² - 1) / 4 (Fu et al. 2015, eq. 10, twice).
+    """
     chi = _positive_determinant(J, epsilon)
+    if _shape(J) == (3, 3):
+        return _guard((_squared_norm(J) * _squared_cofactors(J) * chi**-2 - 1) / 4, chi)
     return _guard(_squared_norm(J) / chi, chi)
 
 
 def area_distortion(J: Jacobian, epsilon: float = 0.0) -> Density:
-    """det J + 1 / det J, 2 where the map keeps areas.
+    """det J + 1 / det J, 2 where the map keeps areas or volumes.
 
     Regularised: (det² J + 1) / χ, which stays positive at flips (Garanzha et al. 2021, eq. 5).
     """
@@ -105,7 +123,7 @@ def isometric_amips(
     +∞ with zero gradient also where it exceeds the range of the dtype, as it soon does at flips.
 
     Args:
-        J: (…, c, 2) Jacobians.
+        J: (…, c, d) Jacobians.
         epsilon: regularisation, see the module's text.
         exponent: s; the larger, the more the worst face counts. exp(s) at an isometry.
         conformal: α, the weight of angles against areas.
@@ -119,21 +137,33 @@ def isometric_amips(
 # -------------------------------------------------------------------- closed forms
 
 
-def _check(J: Tensor) -> None:
-    if J.ndim < 2 or J.shape[-1] != 2 or J.shape[-2] not in (2, 3):
+def _shape(J: Tensor) -> tuple[int, int]:
+    """(c, d), one of the three supported."""
+    shape = (J.shape[-2], J.shape[-1]) if J.ndim >= 2 else (0, 0)
+    if shape not in ((2, 2), (3, 2), (3, 3)):
         raise ValueError(
-            f"distortion: expected J of shape (…, 2, 2) or (…, 3, 2), got {tuple(J.shape)}"
+            "distortion: expected J of shape (…, 2, 2), (…, 3, 2) or (…, 3, 3), "
+            f"got {tuple(J.shape)}"
         )
+    return shape
 
 
 def _squared_norm(J: Tensor) -> Tensor:
     return J.square().sum(dim=(-2, -1))
 
 
+def _squared_cofactors(J: Tensor) -> Tensor:
+    """‖cof J‖² = ‖J⁻¹‖² det² J: the sum over i of the product of all σⱼ² with j ≠ i."""
+    if _shape(J)[1] == 2:
+        return _squared_norm(J)
+    a, b, c = J.unbind(-1)
+    cross = torch.linalg.cross
+    return _squared_norm(torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=-1))
+
+
 def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
     """σ₁ + σ₂ and σ₁ - σ₂, each without cancellation; subgradient zero where a norm vanishes."""
-    _check(J)
-    if J.shape[-2] == 3:
+    if _shape(J) == (3, 2):
         return _spatial_sum_and_difference(J)
     similarity, anti_similarity = _similarity_parts(J)
     norm = torch.linalg.vector_norm

@@ -46,16 +46,18 @@ class CholeskyFactor(Matrix):
         self.shape = (rows, cols)
         self._recipe = (csr, device)
         self._device = torch.device(device)
-        self._release: weakref.finalize[..., CholeskyFactor] | None = None
         arrays = (coo.row.astype(np.int32), coo.col.astype(np.int32), coo.data.astype(np.float64))
         try:
-            self._solver = cholespy.CholeskySolverD(
+            solver = cholespy.CholeskySolverD(
                 rows, *(torch.from_numpy(a).to(device) for a in arrays), cholespy.MatrixType.COO
             )
         except (ValueError, RuntimeError) as error:
             raise ValueError(
                 f"CholeskyFactor: the matrix is not positive definite: {error}"
             ) from error
+        self._handle = _Handle(solver, rows, self._device)
+        # Also runs at exit, where nanobind would complain of solvers that are still alive.
+        weakref.finalize(self, self._handle.close)
 
     def multiply(self, x: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """A⁻¹ x by forward and back substitution, in float64 inside."""
@@ -71,13 +73,7 @@ class CholeskyFactor(Matrix):
         return torch.cat([self._solve(chunk) for chunk in x.split(width, dim=1)], dim=1).to(x.dtype)
 
     def _solve(self, b: Tensor) -> Tensor:
-        b = b.detach().double().contiguous()
-        x = torch.empty_like(b)
-        if b.shape[1]:
-            self._solver.solve(b, x)
-            if self._release is None and not b.is_cuda:
-                self._release = weakref.finalize(self, _release_work_space, self._solver, len(b))
-        return x
+        return self._handle.solve(b.detach().double().contiguous())
 
     def transposed(self) -> CholeskyFactor:
         """Itself: A is symmetric."""
@@ -85,6 +81,33 @@ class CholeskyFactor(Matrix):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return CholeskyFactor, self._recipe
+
+
+class _Handle:
+    """A solver of cholespy, and the clean-up that it needs."""
+
+    def __init__(self, solver: Any, n: int, device: torch.device) -> None:
+        self._solver, self._n, self._device = solver, n, device
+        self._has_work_space = False
+
+    def solve(self, b: Tensor) -> Tensor:
+        """A⁻¹ b of contiguous float64 columns."""
+        x = torch.empty_like(b)
+        if b.shape[1]:
+            self._solver.solve(b, x)
+            self._has_work_space = self._device.type == "cpu"
+        return x
+
+    def close(self) -> None:
+        """Drop the solver, and before that the work space of its last solve, which it would leak.
+
+        cholespy frees it when the next right-hand side has another width; one of width 0 needs none
+        itself. (Without a solve before, that call would crash.)
+        """
+        if self._has_work_space:
+            nothing = torch.empty(self._n, 0, dtype=torch.float64)
+            self._solver.solve(nothing, torch.empty_like(nothing))
+        self._solver = None
 
 
 class BlockDiagonal(Matrix):
@@ -103,13 +126,3 @@ class BlockDiagonal(Matrix):
     def transposed(self) -> BlockDiagonal:
         """Aᵀ."""
         return BlockDiagonal([block.transposed() for block in self._blocks])
-
-
-def _release_work_space(solver: Any, n: int) -> None:
-    """Make cholespy free the work space of its last solve, as it does not when it is dropped.
-
-    It frees it when the next right-hand side has another width; one of width 0 needs none itself.
-    (Without a solve before, that call would crash.)
-    """
-    nothing = torch.empty(n, 0, dtype=torch.float64)
-    solver.solve(nothing, torch.empty_like(nothing))

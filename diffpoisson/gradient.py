@@ -1,8 +1,8 @@
 """The gradient ∇ of piecewise-linear maps, its adjoint ∇ᵀA, and the cotangent Laplacian L = ∇ᵀA∇.
 
 ∇ maps vertex values to one tangent vector per face (paper, eq. 2: Jᵢ = Φ∇ᵢᵀ). Its entries are the
-gradients of the hat functions λ: rotating the edge eᵢ opposite to corner i by 90° gives ∇λᵢ = eᵢ^⊥
-/ 2|t|.
+gradients of the cells' hat functions. For a mesh as it is, ∇ is a constant sparse matrix; for
+positions given as an argument it is applied cell by cell, differentiably in the positions too.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import warnings
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson import cells
 from diffpoisson.linear_map import LinearMap, Matrix
 from diffpoisson.mesh import Mesh
 from diffpoisson.restriction import extend, restrict
@@ -75,21 +76,21 @@ class GradientOperator:
     """∇ of one mesh and what is made of it, assembled once; see `gradient_operator`.
 
     Attributes:
-        matrix: ∇ as a SciPy matrix (2m, n), float64; row 2j + d is tangent direction d on face j.
-        gradient: ∇ as a differentiable map, (n, k) to (2m, k).
-        adjoint: ∇ᵀ as a differentiable map, (2m, k) to (n, k).
-        weights: (2m, 1) float64 area of the face of each row: the diagonal of A.
+        matrix: ∇ as a SciPy matrix (m·d, n), float64; row d·j + i is direction i on face j.
+        gradient: ∇ as a differentiable map, (n, ·) to (m·d, ·).
+        adjoint: ∇ᵀ as a differentiable map, (m·d, ·) to (n, ·).
+        weights: (m·d, 1) float64 measure of the cell of each row: the diagonal of A.
     """
 
     def __init__(self, mesh: Mesh) -> None:
         self.matrix = _gradient_matrix(mesh)
         self.gradient = LinearMap(SparseMatrix(self.matrix, mesh.device))
         self.adjoint = self.gradient.T
-        self.weights = mesh._double_areas.repeat_interleave(2)[:, None]
+        self.weights = mesh._double_measures.repeat_interleave(mesh.cell_dim)[:, None]
 
     @cached_property
     def divergence_matrix(self) -> sp.csr_matrix:
-        """∇ᵀA as a SciPy matrix (n, 2m)."""
+        """∇ᵀA as a SciPy matrix (n, m·d)."""
         weights = self.weights[:, 0].cpu().numpy()
         return (sp.diags(weights) @ self.matrix).T.tocsr()
 
@@ -110,7 +111,11 @@ def gradient_operator(mesh: Mesh) -> GradientOperator:
 
 
 def jacobians(
-    mesh: Mesh, phi: Float[Tensor, "*batch n c"], *, extrinsic: bool = False
+    mesh: Mesh,
+    phi: Float[Tensor, "*batch n c"],
+    *,
+    extrinsic: bool = False,
+    vertices: Float[Tensor, "n D"] | None = None,
 ) -> Float[Tensor, "*batch m c d"]:
     """Jacobian of a piecewise-linear map on each face (paper, eq. 2).
 
@@ -118,10 +123,12 @@ def jacobians(
         mesh: the domain.
         phi: (…, n, c) float32 or float64 image of each vertex, c output coordinates.
         extrinsic: return J Bᵀ, acting on ambient vectors (zero along the normal), instead of J.
+        vertices: (n, D) positions to use instead of the mesh's, to differentiate by.
 
     Returns:
-        (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) if extrinsic; row = output
-        coordinate, column = tangent direction. Dimensionless if the image has the mesh's units.
+        (…, m, c, d) in the coordinates of the faces' frames, d = 2 for triangles and 3 for
+        tetrahedra, or (…, m, c, D) if extrinsic; row = output coordinate, column = tangent
+        direction. Dimensionless if the image has the mesh's units. In the dtype of phi.
 
     Raises:
         ValueError: phi does not have one row per vertex.
@@ -130,23 +137,39 @@ def jacobians(
         raise ValueError(
             f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
         )
-    J = columns_to_matrices(gradient_operator(mesh).gradient(vertices_to_columns(phi)), phi.shape)
+    if vertices is not None:
+        geometry = CellGeometry.at(mesh, vertices)
+        J = geometry.gradient(phi.double())
+        return (extend(J, geometry.frames) if extrinsic else J).to(phi.dtype)
+    columns = gradient_operator(mesh).gradient(vertices_to_columns(phi))
+    J = columns_to_matrices(columns, phi.shape, mesh.cell_dim)
     return extend(J, mesh._double_frames) if extrinsic else J
 
 
-def divergence(mesh: Mesh, R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "*batch n c"]:
+def divergence(
+    mesh: Mesh,
+    R: Float[Tensor, "*batch m c k"],
+    *,
+    vertices: Float[Tensor, "n D"] | None = None,
+) -> Float[Tensor, "*batch n c"]:
     """∇ᵀA R, the adjoint of the gradient in the area-weighted inner product.
 
     This is the integrated divergence with the sign of an adjoint: ⟨∇ᵀA R, Φ⟩ = Σ |tⱼ| ⟨Rⱼ, (∇Φ)ⱼ⟩.
 
     Args:
         mesh: the domain.
-        R: (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) on ambient vectors.
+        R: (…, m, c, d) in the coordinates of the faces' frames, or (…, m, c, D) on ambient vectors.
+        vertices: (n, D) positions to use instead of the mesh's, to differentiate by; intrinsic R
+            stays what it is in the coordinates of the moving frames.
 
     Raises:
         ValueError: R does not have one such matrix per face.
     """
-    R = as_intrinsic("divergence", mesh, R)
+    if vertices is not None:
+        geometry = CellGeometry.at(mesh, vertices)
+        intrinsic = as_intrinsic("divergence", mesh, R.double(), geometry.frames)
+        return geometry.divergence(intrinsic).to(R.dtype)
+    R = as_intrinsic("divergence", mesh, R, mesh._double_frames)
     operator, columns = gradient_operator(mesh), matrices_to_columns(R)
     return columns_to_vertices(operator.adjoint(operator.weights.to(R.dtype) * columns), R.shape)
 
@@ -157,17 +180,64 @@ def laplacian(mesh: Mesh) -> sp.csr_matrix:
 
 
 def as_intrinsic(
-    operation: str, mesh: Mesh, R: Float[Tensor, "*batch m c k"]
+    operation: str, mesh: Mesh, R: Float[Tensor, "*batch m c k"], frames: Float[Tensor, "m D d"]
 ) -> Float[Tensor, "*batch m c d"]:
     """R in frame coordinates, restricted if it acts on ambient vectors; any other shape raises."""
-    D, d = mesh.dim, 2
+    D, d = mesh.dim, mesh.cell_dim
     if R.ndim < 3 or R.shape[-3] != mesh.n_faces or R.shape[-1] not in (d, D):
         sizes = " or ".join(str(size) for size in sorted({d, D}))
         raise ValueError(
             f"{operation}: expected one matrix per face, (…, m={mesh.n_faces}, c, {sizes}), "
             f"got {tuple(R.shape)}"
         )
-    return R if R.shape[-1] == d else restrict(R, mesh._double_frames)
+    return R if R.shape[-1] == d else restrict(R, frames)
+
+
+class CellGeometry(NamedTuple):
+    """The gradient at given positions, cell by cell: differentiable in field and positions.
+
+    Attributes:
+        mesh: the cells, at whatever positions.
+        hats: (m, d, k) hat gradients, in frame coordinates.
+        frames: (m, D, d) tangent bases.
+        measures: (m,) areas or volumes.
+    """
+
+    mesh: Mesh
+    hats: Float[Tensor, "m d k"]
+    frames: Float[Tensor, "m D d"]
+    measures: Float[Tensor, "m"]
+
+    @classmethod
+    def at(cls, mesh: Mesh, vertices: Float[Tensor, "n D"]) -> CellGeometry:
+        """The geometry of a mesh's cells at other positions, in float64."""
+        if vertices.shape != mesh.vertices.shape:
+            raise ValueError(
+                f"expected vertices of shape {tuple(mesh.vertices.shape)}, "
+                f"got {tuple(vertices.shape)}"
+            )
+        corners = vertices.double()[mesh.faces]
+        frames = cells.frames(corners)
+        hats = cells.hat_gradients(corners, frames)
+        return cls(mesh, hats, frames, cells.measures(corners))
+
+    def gradient(self, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch m c d"]:
+        """∇Φ on each cell."""
+        return (self.hats @ phi[..., self.mesh.faces, :]).mT
+
+    def divergence(
+        self, R: Float[Tensor, "*batch m c d"], weights: Float[Tensor, "m"] | None = None
+    ) -> Float[Tensor, "*batch n c"]:
+        """∇ᵀA R at each vertex, with the weights, if any, in A."""
+        A = self.measures if weights is None else self.measures * weights
+        at_corners = A[:, None, None] * (R @ self.hats).mT  # (…, m, k, c)
+        zeros = at_corners.new_zeros(*R.shape[:-3], self.mesh.n_vertices, R.shape[-2])
+        return zeros.index_add(-2, self.mesh.faces.flatten(), at_corners.flatten(-3, -2))
+
+    def vertex_measures(self) -> Float[Tensor, "n"]:
+        """An equal share of the measure of each cell around a vertex."""
+        shares = self.measures[:, None] / self.mesh.faces.shape[1]
+        return self.mesh.sum_at_vertices(shares)[:, 0]
 
 
 # ------------------------------------------------------- fields as columns, for sparse products
@@ -192,12 +262,12 @@ def matrices_to_columns(R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "rows
 
 
 def columns_to_matrices(
-    columns: Float[Tensor, "rows k"], shape: torch.Size
+    columns: Float[Tensor, "rows k"], shape: torch.Size, d: int
 ) -> Float[Tensor, "*batch m c d"]:
-    """(2m, …·c) back to (…, m, c, 2), given the shape (…, n, c) of the map it came from."""
+    """(m·d, …·c) back to (…, m, c, d), given the shape (…, n, c) of the map it came from."""
     return (
         columns.unflatten(1, (*shape[:-2], shape[-1]))
-        .unflatten(0, (-1, 2))
+        .unflatten(0, (-1, d))
         .movedim((0, 1), (-3, -1))
     )
 
@@ -206,22 +276,12 @@ def columns_to_matrices(
 
 
 def _gradient_matrix(mesh: Mesh) -> sp.csr_matrix:
-    """∇ as (2m, n): row 2j + d holds component d of the three hat gradients of face j."""
-    m = mesh.n_faces
-    values = _hat_gradients(mesh).cpu().numpy()  # (m, 2, 3)
-    columns = mesh.faces.cpu().numpy().repeat(2, axis=0)
-    rows = np.arange(0, 6 * m + 1, 3)
-    matrix = sp.csr_matrix((values.ravel(), columns.ravel(), rows), shape=(2 * m, mesh.n_vertices))
+    """∇ as (m·d, n): row d·j + i holds component i of the hat gradients of face j."""
+    d, k = mesh.cell_dim, mesh.cell_dim + 1
+    values = cells.hat_gradients(mesh._corners, mesh._double_frames).cpu().numpy()  # (m, d, k)
+    columns = mesh.faces.cpu().numpy().repeat(d, axis=0)
+    rows = np.arange(0, values.size + 1, k)
+    shape = (d * mesh.n_faces, mesh.n_vertices)
+    matrix = sp.csr_matrix((values.ravel(), columns.ravel(), rows), shape=shape)
     matrix.sort_indices()
     return matrix
-
-
-def _hat_gradients(mesh: Mesh) -> Float[Tensor, "m 2 3"]:
-    """∇λᵢ = eᵢ^⊥ / 2|t| in frame coordinates, float64; column i belongs to corner i."""
-    corners = mesh.vertices.double()[mesh.faces]
-    opposite = corners.roll(1, dims=1) - corners.roll(-1, dims=1)  # e₀ = v₂ - v₁, …
-    x, y = (opposite @ mesh._double_frames).unbind(2)
-    doubled_area = 2 * mesh._double_areas
-    if mesh.dim == 2:  # clockwise faces: the rotation by 90° turns the other way
-        doubled_area = mesh._doubled_area_vectors
-    return torch.stack([-y, x], dim=1) / doubled_area[:, None, None]

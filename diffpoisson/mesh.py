@@ -1,4 +1,4 @@
-"""The triangle mesh on which every operator of this package is defined, validated once."""
+"""The mesh on which every operator of this package is defined, validated once."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import csgraph
 from torch import Tensor
 
-ArrayLike = Tensor | np.ndarray
+from diffpoisson import cells, topology
 
-# Both components of a computed cross product of a and b carry an absolute rounding error below
-# 8u |a||b|, u the unit roundoff of float64 (two differences, two products, one subtraction each).
-# A triangle whose largest angle has a smaller sine cannot be told from a segment in float64.
-_SINE_ROUNDOFF = 8 * 2.0**-53
+ArrayLike = Tensor | np.ndarray
 
 
 class MeshError(ValueError):
@@ -39,22 +34,35 @@ class CleanedMesh(NamedTuple):
     face_map: Tensor
 
 
+# Cached properties of a mesh that do not depend on its vertices.
+_OF_FACES = (
+    "components",
+    "euler_characteristic",
+    "is_manifold",
+    "boundary_loops",
+    "is_disk",
+    "part_of_vertex",
+    "part_of_face",
+)
+
+
 class Mesh:
-    """An immutable triangle mesh in the plane (D = 2) or in space (D = 3).
+    """An immutable mesh: triangles in the plane (D = 2) or in space (D = 3), or tetrahedra.
 
     Open, closed, disconnected, non-orientable and non-manifold meshes are all fine; what is not is
     listed under *Raises*. Lengths are in the mesh's own units. Geometry is computed in float64 and
-    handed out in the dtype of `vertices`.
+    handed out in the dtype of `vertices`. Where this package says face, a tetrahedral mesh has its
+    tetrahedra.
 
     Args:
         vertices: (n, D) float32 or float64 positions.
-        faces: (m, 3) integer vertex indices; counter-clockwise seen from the side the normal points
-            to.
+        faces: (m, 3) integer vertex indices, counter-clockwise seen from the side the normal points
+            to; or (m, 4) for tetrahedra, positively oriented like (0, x, y, z).
 
     Raises:
         MeshError: wrong shape or dtype, no faces, an index out of range or repeated within a face,
             a vertex that is not finite, that requires grad, or that no face uses, or a face of zero
-            area. The message gives counts, the first indices, and the remedy.
+            area or volume. The message gives counts, the first indices, and the remedy.
     """
 
     vertices: Tensor
@@ -112,6 +120,11 @@ class Mesh:
         return self.vertices.shape[1]
 
     @property
+    def cell_dim(self) -> int:
+        """Dimension d of a cell: 2 for triangles, 3 for tetrahedra."""
+        return self.faces.shape[1] - 1
+
+    @property
     def dtype(self) -> torch.dtype:
         """Floating dtype of the vertices and of every derived quantity."""
         return self.vertices.dtype
@@ -120,6 +133,25 @@ class Mesh:
     def device(self) -> torch.device:
         """Device of the vertices and of every derived quantity."""
         return self.vertices.device
+
+    def with_vertices(self, vertices: Tensor) -> Mesh:
+        """The same faces at other positions; what depends on the faces alone is kept.
+
+        Raises:
+            MeshError: as for a new mesh, or another shape, dtype or device than before.
+        """
+        before = (self.vertices.shape, self.dtype, self.device)
+        if (vertices.shape, vertices.dtype, vertices.device) != before:
+            raise MeshError(
+                f"Mesh.with_vertices: expected {tuple(self.vertices.shape)} {self.dtype} on "
+                f"{self.device}, got {tuple(vertices.shape)} {vertices.dtype} on {vertices.device}"
+            )
+        _validate(vertices, self.faces)
+        moved = object.__new__(Mesh)
+        moved._assign(vertices.clone(), self.faces, self.vertex_offsets, self.face_offsets)
+        kept = {name: self.__dict__[name] for name in _OF_FACES if name in self.__dict__}
+        moved.__dict__.update(kept)
+        return moved
 
     def to(self, target: torch.dtype | torch.device | str) -> Mesh:
         """The same mesh in another floating dtype or on another device."""
@@ -133,106 +165,123 @@ class Mesh:
     # ---------------------------------------------------------------- geometry
 
     @cached_property
-    def _doubled_area_vectors(self) -> Tensor:
-        """(m, 3) or (m,) float64: e × e' per face, a signed number in the plane."""
-        return _doubled_area_vectors(self.vertices.double()[self.faces])[0]
+    def _corners(self) -> Float[Tensor, "m k D"]:
+        """Float64 positions of the corners of each cell."""
+        return self.vertices.double()[self.faces]
 
     @cached_property
-    def _double_areas(self) -> Float[Tensor, "m"]:
-        """Float64 areas, for operators that are assembled in double whatever the mesh's dtype."""
-        cross = self._doubled_area_vectors
-        return (cross.abs() if self.dim == 2 else torch.linalg.vector_norm(cross, dim=1)) / 2
+    def _double_measures(self) -> Float[Tensor, "m"]:
+        """Float64 measures, for operators assembled in double whatever the mesh's dtype."""
+        return cells.measures(self._corners)
 
     @cached_property
-    def _double_frames(self) -> Float[Tensor, "m D 2"]:
+    def _double_frames(self) -> Float[Tensor, "m D d"]:
         """Float64 frames (see `frames`)."""
-        if self.dim == 2:
-            return torch.eye(2, dtype=torch.float64, device=self.device).expand(self.n_faces, 2, 2)
-        a, b = self.vertices.double()[self.faces[:, :2]].unbind(1)
-        x = torch.nn.functional.normalize(b - a, dim=1, eps=0)
-        normal = torch.nn.functional.normalize(self._doubled_area_vectors, dim=1, eps=0)
-        return torch.stack([x, torch.linalg.cross(normal, x)], dim=2)
+        return cells.frames(self._corners)
 
     @cached_property
+    def measures(self) -> Float[Tensor, "m"]:
+        """Area of each triangle in units², or volume of each tetrahedron in units³; positive."""
+        return self._double_measures.to(self.dtype)
+
+    @property
     def areas(self) -> Float[Tensor, "m"]:
         """Area |tⱼ| of each face, in units²; positive also for clockwise faces of a planar mesh."""
-        return self._double_areas.to(self.dtype)
+        self._require_triangles("areas")
+        return self.measures
+
+    @property
+    def volumes(self) -> Float[Tensor, "m"]:
+        """Volume of each tetrahedron, in units³; positive also for inverted ones."""
+        if self.cell_dim != 3:
+            raise MeshError("volumes need tetrahedra: faces are (m, 3), not (m, 4)")
+        return self.measures
 
     @cached_property
     def normals(self) -> Float[Tensor, "m 3"]:
-        """Unit normal of each face; only in space."""
-        if self.dim != 3:
-            raise MeshError(f"normals need a mesh in space: vertices have D = {self.dim}, not 3")
-        cross = self._doubled_area_vectors
-        return torch.nn.functional.normalize(cross, dim=1, eps=0).to(self.dtype)
+        """Unit normal of each triangle; only in space."""
+        vectors = self._area_vectors("normals")
+        return (vectors / torch.linalg.vector_norm(vectors, dim=1, keepdim=True)).to(self.dtype)
 
     @cached_property
-    def frames(self) -> Float[Tensor, "m D 2"]:
+    def frames(self) -> Float[Tensor, "m D d"]:
         """Orthonormal, oriented basis B of each tangent plane as columns: B₁ × B₂ = normal.
 
-        The first column points along the face's first edge. In the plane, the identity.
-        Nothing computed by this package depends on this choice (paper, appendix).
+        The first column points along the face's first edge. In the plane and for tetrahedra, the
+        identity. Nothing computed by this package depends on this choice (paper, appendix).
         """
         return self._double_frames.to(self.dtype)
 
     @cached_property
     def centroids(self) -> Float[Tensor, "m D"]:
-        """Barycentre of each face."""
+        """Barycentre of each cell."""
         return self.vertices[self.faces].mean(dim=1)
 
     @cached_property
-    def _double_vertex_areas(self) -> Float[Tensor, "n"]:
-        """Float64 vertex areas (see `vertex_areas`)."""
-        thirds = (self._double_areas / 3).repeat_interleave(3)
-        total = torch.zeros(self.n_vertices, dtype=torch.float64, device=self.device)
-        return total.index_add(0, self.faces.flatten(), thirds)
+    def _double_vertex_measures(self) -> Float[Tensor, "n"]:
+        """Float64 vertex measures (see `vertex_measures`)."""
+        return self.sum_at_vertices(self._double_measures[:, None] / self.faces.shape[1])[:, 0]
 
     @cached_property
+    def vertex_measures(self) -> Float[Tensor, "n"]:
+        """Lumped mass: an equal share of the measure of each cell around a vertex."""
+        return self._double_vertex_measures.to(self.dtype)
+
+    @property
     def vertex_areas(self) -> Float[Tensor, "n"]:
-        """Lumped mass |Vⱼ|: a third of the area around each vertex."""
-        return self._double_vertex_areas.to(self.dtype)
+        """Lumped mass |Vⱼ|: a third of the area around each vertex, in units²."""
+        self._require_triangles("vertex_areas")
+        return self.vertex_measures
 
     @cached_property
     def vertex_normals(self) -> Float[Tensor, "n 3"]:
         """Unit vertex normals, the faces' weighted by area; zero where those cancel."""
-        if self.dim != 3:
-            raise MeshError(f"vertex_normals need a mesh in space: D = {self.dim}, not 3")
-        corners = self._doubled_area_vectors.repeat_interleave(3, dim=0)
-        total = torch.zeros(self.n_vertices, 3, dtype=torch.float64, device=self.device)
-        total = total.index_add(0, self.faces.flatten(), corners)
+        total = self.sum_at_vertices(self._area_vectors("vertex_normals"))
         lengths = torch.linalg.vector_norm(total, dim=1, keepdim=True)
         return torch.where(lengths > 0, total / lengths, 0).to(self.dtype)
+
+    def sum_at_vertices(self, values: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
+        """Sum of cell values over the cells around each vertex; differentiable."""
+        k = self.faces.shape[1]
+        total = values.new_zeros(self.n_vertices, values.shape[1])
+        return total.index_add(0, self.faces.flatten(), values.repeat_interleave(k, dim=0))
+
+    def _area_vectors(self, name: str) -> Float[Tensor, "m 3"]:
+        """Twice the area times the unit normal of each triangle in space, float64."""
+        self._require_triangles(name)
+        if self.dim != 3:
+            raise MeshError(f"{name} need a mesh in space: vertices have D = {self.dim}, not 3")
+        return cells.determinants(self._corners)
+
+    def _require_triangles(self, name: str) -> None:
+        if self.cell_dim != 2:
+            raise MeshError(f"{name} need triangles: faces are (m, 4), tetrahedra")
 
     # ---------------------------------------------------------------- topology
 
     @cached_property
     def components(self) -> Int[Tensor, "n"]:
         """Label in 0 … n_components - 1 of the connected component of each vertex."""
-        a, b, c = self._numpy_faces.T
-        links = (np.concatenate([a, b]), np.concatenate([b, c]))
-        graph = sp.coo_matrix((np.ones(2 * self.n_faces), links), shape=(self.n_vertices,) * 2)
-        labels = csgraph.connected_components(graph, directed=False)[1]
-        return torch.from_numpy(labels.astype(np.int64)).to(self.device)
+        labels = topology.component_labels(self._numpy_faces, self.n_vertices)
+        return torch.from_numpy(labels).to(self.device)
 
     @property
     def n_components(self) -> int:
-        """Number of connected components; faces that share a vertex are connected."""
+        """Number of connected components; cells that share a vertex are connected."""
         return int(self.components.max()) + 1
 
     @cached_property
     def euler_characteristic(self) -> int:
-        """V - E + F."""
-        n_edges = len(_undirected_edges(self._numpy_faces)[0])
+        """V - E + F of a triangle mesh."""
+        self._require_triangles("euler_characteristic")
+        n_edges = len(topology.undirected_edges(self._numpy_faces)[0])
         return self.n_vertices - n_edges + self.n_faces
 
     @cached_property
     def is_manifold(self) -> bool:
         """Whether edges have at most two, consistently oriented faces and vertices one fan."""
-        faces = self._numpy_faces
-        half_edges = _half_edges(faces)
-        if len(np.unique(half_edges, axis=0)) < len(half_edges):
-            return False
-        return _count_fans(faces) == self.n_vertices
+        self._require_triangles("is_manifold")
+        return topology.is_manifold(self._numpy_faces, self.n_vertices)
 
     @cached_property
     def boundary_loops(self) -> list[Tensor]:
@@ -242,25 +291,23 @@ class Mesh:
             MeshError: the boundary touches itself or ends at a non-manifold edge, or faces are
                 inconsistently oriented.
         """
-        edges, counts = _undirected_edges(self._numpy_faces)
-        half_edges = _half_edges(self._numpy_faces)
-        on_boundary = np.isin(
-            _edge_keys(np.sort(half_edges, axis=1)), _edge_keys(edges[counts == 1])
-        )
-        tails, heads = half_edges[on_boundary].T
+        self._require_triangles("boundary_loops")
+        tails, heads = topology.boundary_half_edges(self._numpy_faces).T
         for ends in (tails, heads):
             if len(np.unique(ends)) < len(ends):
                 vertex = np.flatnonzero(np.bincount(ends) > 1)
                 raise MeshError(
-                    f"boundary_loops: the boundary passes {_some(vertex, 'vertex', 'vertices')} "
-                    "more than once; split such vertices, and orient the faces consistently"
+                    "boundary_loops: the boundary passes "
+                    f"{describe_indices(vertex, 'vertex', 'vertices')} more than once; split such "
+                    "vertices, and orient the faces consistently"
                 )
         if (open_ends := np.setxor1d(tails, heads)).size:
             raise MeshError(
-                f"boundary_loops: the boundary ends at {_some(open_ends, 'vertex', 'vertices')}, "
+                "boundary_loops: the boundary ends at "
+                f"{describe_indices(open_ends, 'vertex', 'vertices')}, "
                 "on an edge of three or more faces; split such edges"
             )
-        return [torch.from_numpy(loop).to(self.device) for loop in _cycles(tails, heads)]
+        return [torch.from_numpy(loop).to(self.device) for loop in topology.cycles(tails, heads)]
 
     @cached_property
     def is_disk(self) -> bool:
@@ -282,7 +329,7 @@ class Mesh:
         """
         if not meshes:
             raise MeshError("Mesh.concatenate: needs at least one mesh")
-        kinds = sorted({f"D={mesh.dim} {mesh.dtype} {mesh.device}" for mesh in meshes})
+        kinds = sorted({f"D={m.dim} d={m.cell_dim} {m.dtype} {m.device}" for m in meshes})
         if len(kinds) > 1:
             raise MeshError(
                 f"Mesh.concatenate: meshes must agree in dimension, dtype and device, got {kinds}"
@@ -349,7 +396,7 @@ class Mesh:
         new_faces = merged[faces * in_range[:, None]] if len(vertices) else faces
         keep = in_range & ~_repeated(new_faces)
         keep[keep.clone()] &= vertices.isfinite().all(dim=1)[new_faces[keep]].all(dim=1)
-        keep[keep.clone()] &= ~_zero_area(vertices, new_faces[keep])
+        keep[keep.clone()] &= ~cells.degenerate(vertices.double()[new_faces[keep]])
         if not keep.any():
             raise MeshError(f"Mesh.cleaned: none of the {len(faces)} faces is usable")
 
@@ -396,12 +443,19 @@ def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
         )
     if vertices.requires_grad:
         raise MeshError(
-            "Mesh: vertices require grad, but operators are constant in the geometry, so its "
-            "gradient would silently be zero; pass vertices.detach()"
+            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
+            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
+            "the solver"
         )
-    if faces.ndim != 2 or faces.shape[1] != 3:
+    if faces.ndim != 2 or faces.shape[1] not in (3, 4):
         raise MeshError(
-            f"Mesh: faces must be (m, 3), got {tuple(faces.shape)}; triangulate polygons first"
+            f"Mesh: faces must be (m, 3), or (m, 4) for tetrahedra, got {tuple(faces.shape)}; "
+            "triangulate polygons first"
+        )
+    if faces.shape[1] == 4 and vertices.shape[1] != 3:
+        raise MeshError(
+            "Mesh: faces of four vertices are tetrahedra, which need vertices (n, 3), got "
+            f"{tuple(vertices.shape)}; triangulate quads first"
         )
     if not _is_integer(faces):
         raise MeshError(f"Mesh: faces must have an integer dtype, got {faces.dtype}")
@@ -410,7 +464,7 @@ def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
 def _validate(vertices: Tensor, faces: Tensor) -> None:
     _check_arrays(vertices, faces)
     if len(faces) == 0:
-        raise MeshError("Mesh: no faces; an operator needs at least one triangle")
+        raise MeshError("Mesh: no faces; an operator needs at least one cell")
     n = len(vertices)
     _reject(((faces < 0) | (faces >= n)).any(dim=1), f"with a vertex index outside 0 … {n - 1}")
     _reject(_repeated(faces), "with a repeated vertex index")
@@ -419,115 +473,50 @@ def _validate(vertices: Tensor, faces: Tensor) -> None:
     used = torch.zeros(n, dtype=torch.bool, device=vertices.device)
     used[faces.flatten()] = True
     _reject(~used, "that no face uses", ("vertex", "vertices"))
-    _reject(_zero_area(vertices, faces), "of zero area")
+    _reject(cells.degenerate(vertices.double()[faces]), _flat(faces))
     _check_range(vertices, faces)
 
 
 def _check_range(vertices: Tensor, faces: Tensor) -> None:
-    """Areas must be normal numbers in the mesh's dtype, and their squares in float64.
+    """Measures must be normal numbers in the mesh's dtype, and their squares in float64.
 
     Norms of area vectors pass through the squares.
     """
-    cross = _doubled_area_vectors(vertices.double()[faces])[0]
-    squared = (cross.square() if cross.ndim == 1 else cross.square().sum(1)) / 4
-    for quantity in (squared, squared.sqrt().to(vertices.dtype)):
+    measures = cells.measures(vertices.double()[faces])
+    for quantity in (measures.square(), measures.to(vertices.dtype)):
         range_ = torch.finfo(quantity.dtype)
         if not ((quantity >= range_.tiny) & (quantity <= range_.max)).all():
             raise MeshError(
-                f"Mesh: areas leave the range of {vertices.dtype}; rescale the vertices"
+                f"Mesh: {_measure(faces)}s leave the range of {vertices.dtype}; rescale the "
+                "vertices"
             )
+
+
+def _measure(faces: Tensor) -> str:
+    return "area" if faces.shape[1] == 3 else "volume"
+
+
+def _flat(faces: Tensor) -> str:
+    quads = " (faces of four vertices are tetrahedra; triangulate quads)"
+    return f"of zero {_measure(faces)}" + (quads if faces.shape[1] == 4 else "")
 
 
 def _reject(bad: Bool[Tensor, "k"], what: str, noun: tuple[str, str] = ("face", "faces")) -> None:
     if bad.any():
-        culprits = _some(bad.nonzero()[:, 0].cpu().numpy(), *noun)
+        culprits = describe_indices(bad.nonzero()[:, 0], *noun)
         raise MeshError(f"Mesh: {culprits} {what}; Mesh.cleaned(vertices, faces) drops them")
 
 
-def _some(indices: np.ndarray, singular: str, plural: str, show: int = 5) -> str:
+def describe_indices(
+    indices: np.ndarray | Tensor, singular: str, plural: str, show: int = 5
+) -> str:
     """'3 faces [7, 8, 12]', shortened after the first few indices."""
-    listed = ", ".join(map(str, indices[:show])) + (", …" if len(indices) > show else "")
+    listed = ", ".join(map(str, indices[:show].tolist())) + (", …" if len(indices) > show else "")
     return f"{len(indices)} {singular if len(indices) == 1 else plural} [{listed}]"
 
 
-def _repeated(faces: Int[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
-    a, b, c = faces.unbind(1)
-    return (a == b) | (b == c) | (c == a)
-
-
-def _doubled_area_vectors(corners: Float[Tensor, "m 3 D"]) -> tuple[Tensor, Tensor]:
-    """Cross product of two edges of each triangle, and the product of their lengths.
-
-    Any two edges give the same cross product, but on a needle those at the widest corner (the two
-    shortest) lose no digits to cancellation.
-    """
-    edges = corners.roll(-1, dims=1) - corners  # edge i leaves corner i
-    longest = torch.linalg.vector_norm(edges, dim=2).argmax(dim=1)
-    rows = torch.arange(len(corners), device=corners.device)
-    after, before = edges[rows, (longest + 1) % 3], edges[rows, (longest + 2) % 3]
-    lengths = torch.linalg.vector_norm(after, dim=1) * torch.linalg.vector_norm(before, dim=1)
-    if corners.shape[2] == 2:
-        return after[:, 0] * before[:, 1] - after[:, 1] * before[:, 0], lengths
-    return torch.linalg.cross(after, before), lengths
-
-
-def _zero_area(vertices: Tensor, faces: Tensor) -> Bool[Tensor, "m"]:
-    """Faces whose area is indistinguishable from zero in float64, at any scale of the mesh."""
-    cross, lengths = _doubled_area_vectors(vertices.double()[faces])
-    size = cross.abs() if cross.ndim == 1 else torch.linalg.vector_norm(cross, dim=1)
-    return size <= _SINE_ROUNDOFF * lengths
-
-
-# -------------------------------------------------------------------- topology
-
-
-def _half_edges(faces: np.ndarray) -> np.ndarray:
-    """(3m, 2) directed edges, all first edges, then all second, then all third."""
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-
-
-def _undirected_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(E, 2) sorted unique edges, and the number of faces at each."""
-    return np.unique(np.sort(_half_edges(faces), axis=1), axis=0, return_counts=True)
-
-
-def _edge_keys(edges: np.ndarray) -> np.ndarray:
-    """One integer per (i, j), injective for indices below 2³¹."""
-    return edges[:, 0] * np.int64(2**31) + edges[:, 1]
-
-
-def _count_fans(faces: np.ndarray) -> int:
-    """Number of face fans around all vertices, of a mesh whose half-edges are unique.
-
-    Corners are glued where their faces share an edge; a vertex is manifold if all its corners
-    become one.
-    """
-    m = len(faces)
-    tails, heads = _half_edges(faces).T
-    tail_corner = np.arange(3 * m)
-    head_corner = np.concatenate(
-        [tail_corner[m:], tail_corner[:m]]
-    )  # corner i + 1 of the same face
-    graph = sp.csr_matrix(
-        (tail_corner + 1, (tails, heads)), shape=(faces.max() + 1,) * 2
-    )  # half-edge index + 1, so that 0 means none
-    opposite = np.asarray(graph[heads, tails]).ravel() - 1
-    inner = np.flatnonzero(opposite >= 0)
-    pairs = (tail_corner[inner], head_corner[opposite[inner]])
-    glue = sp.coo_matrix((np.ones(len(inner)), pairs), shape=(3 * m, 3 * m))
-    return int(csgraph.connected_components(glue, directed=False)[0])
-
-
-def _cycles(tails: np.ndarray, heads: np.ndarray) -> list[np.ndarray]:
-    """Vertex cycles of a graph in which each vertex has one successor, longest first."""
-    if len(tails) == 0:
-        return []
-    size = int(max(tails.max(), heads.max())) + 1
-    graph = sp.csr_matrix((np.ones(len(tails)), (tails, heads)), shape=(size, size))
-    labels = csgraph.connected_components(graph, directed=False)[1]
-    starts = tails[np.unique(labels[tails], return_index=True)[1]]
-    loops = [csgraph.depth_first_order(graph, s, return_predecessors=False) for s in starts]
-    return sorted((loop.astype(np.int64) for loop in loops), key=len, reverse=True)
+def _repeated(faces: Int[Tensor, "m k"]) -> Bool[Tensor, "m"]:
+    return (faces.sort(dim=1).values.diff(dim=1) == 0).any(dim=1)
 
 
 # -------------------------------------------------------------------- indices

@@ -1,35 +1,46 @@
 """The Poisson layer: the map whose Jacobians are closest to given ones, Φ = L⁻¹ ∇ᵀA R.
 
-    Φ = argmin Σⱼ |tⱼ| ‖(∇Φ)ⱼ - Rⱼ‖²   ⟺   L Φ = ∇ᵀA R,  L = ∇ᵀA∇        (paper, Poisson system)
+    Φ = argmin Σⱼ wⱼ|tⱼ| ‖(∇Φ)ⱼ - Rⱼ‖² + Σₕ aₕ ‖Φₕ - qₕ‖²   subject to Φₚ = qₚ at pins
 
-The minimiser is unique up to one translation per connected component. Eliminating one vertex of
-each component leaves a positive definite matrix, factorised once; the gauge then fixes the
-translations.
+with face weights w (all one in the paper), soft handles h of strength a, and pins p. Its normal
+equations are (L + W) Φ = ∇ᵀA R + W q, L = ∇ᵀA∇. Pinned rows are eliminated; a connected component
+with neither pin nor handle is determined up to a translation, so one vertex of it, its anchor, is
+eliminated too, and the gauge fixes the translation. What remains is positive definite, and
+factorised once.
+
+Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For
+positions v with the same values that require grad, k steps of refinement
+
+    Φ ← Φ + F⁻¹ (b(v) - L(v) Φ)
+
+change no value, but make the result's derivatives by v exact up to order k: each step turns an
+error of order j in a perturbation of v into one of order j + 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
+    CellGeometry,
     SparseMatrix,
     as_intrinsic,
     columns_to_vertices,
     gradient_operator,
     matrices_to_columns,
+    vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix
+from diffpoisson.linear_map import LinearMap, Matrix, require_equal
 from diffpoisson.mesh import Mesh
-
-Gauge = Literal["mean", "vertex"]
 
 
 class PoissonSolver:
@@ -37,122 +48,291 @@ class PoissonSolver:
 
     Args:
         mesh: the domain; any number of components.
-        gauge: what fixes the translation of each connected component: `"mean"`, its area-weighted
-            mean is zero, or `"vertex"`, its vertex of lowest index (its anchor) maps to zero.
+        gauge: what fixes the translation of each component that holds no pin or handle: `"mean"`,
+            its area-weighted mean is zero; `"vertex"`, its vertex of lowest index maps to zero; or
+            a (n,) mask, the area-weighted mean of its masked vertices is zero.
+        pins: (p,) indices of vertices whose images will be given, or a (n,) mask.
+        handles: (h,) indices of vertices that will be attracted to given points, or a (n,) mask.
+        handle_weights: strength of all or of each handle, against faces that count by their area;
+            in the unit of the measures over the square of the unit of the map.
+        face_weights: (m,) non-negative factor on the area of each face; zero leaves it out of the
+            fit.
 
     Attributes:
         mesh: the domain.
-        gauge: as given.
+        constraints: the validated constraints.
+
+    Raises:
+        ValueError: indices out of range, named twice, or both pinned and handles; every vertex
+            pinned; weights that are negative or not finite; a vertex that only faces of weight zero
+            touch; a gauge mask that misses a component.
     """
 
-    def __init__(self, mesh: Mesh, *, gauge: Gauge = "mean") -> None:
-        anchors = _first_of_each(mesh.components.cpu().numpy())
-        free = np.setdiff1d(np.arange(mesh.n_vertices), anchors)
-        operator = gradient_operator(mesh)
-        factor = CholeskyFactor(operator.laplacian[free][:, free], mesh.device)
-        self._assign(mesh, gauge, factor, free, operator.divergence_matrix[free])
+    def __init__(
+        self,
+        mesh: Mesh,
+        *,
+        gauge: Gauge | Bool[Tensor, "n"] = "mean",
+        pins: Int[Tensor, "p"] | Bool[Tensor, "n"] | None = None,
+        handles: Int[Tensor, "h"] | Bool[Tensor, "n"] | None = None,
+        handle_weights: Float[Tensor, "h"] | float = 1.0,
+        face_weights: Float[Tensor, "m"] | None = None,
+    ) -> None:
+        self._options: dict[str, Any] = {
+            "gauge": gauge,
+            "pins": pins,
+            "handles": handles,
+            "handle_weights": handle_weights,
+            "face_weights": face_weights,
+        }
+        constraints = Constraints.build(mesh, **self._options)
+        free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
+        divergence, L = _assemble(mesh, constraints)
+        factor = CholeskyFactor(L[free][:, free], mesh.device)
+        self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
-        self, mesh: Mesh, gauge: Gauge, factor: Matrix, free: np.ndarray, divergence: sp.csr_matrix
+        self,
+        mesh: Mesh,
+        constraints: Constraints,
+        factor: Matrix,
+        divergence: sp.csr_matrix,
+        coupling: sp.csr_matrix,
     ) -> None:
-        if gauge not in ("mean", "vertex"):
-            raise ValueError(f"PoissonSolver: gauge must be 'mean' or 'vertex', got {gauge!r}")
-        self.mesh, self.gauge = mesh, gauge
-        self._factor, self._free, self._divergence_matrix = factor, free, divergence
-        self._free_index = torch.from_numpy(free).to(mesh.device)
-        self._divergence = LinearMap(SparseMatrix(divergence, mesh.device))
+        """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
+        self.mesh, self.constraints = mesh, constraints
+        self._parts = (factor, divergence, coupling)
         self._inverse = LinearMap(factor)
-        # Computed here, not at first use: torch.compile cannot trace what fills a cache.
-        self._labels, _ = mesh.components, mesh._double_frames
-        self._mean_weights = _shares(mesh._double_vertex_areas, self._labels)
+        self._divergence = LinearMap(SparseMatrix(divergence, mesh.device))
+        self._coupling = LinearMap(SparseMatrix(coupling, mesh.device))
+        free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
+        free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
+        self._handle_rows = free_index[constraints.handles]
+        # Made here, not at first use: torch.compile cannot trace what fills a cache.
+        self._frames = mesh._double_frames
+        self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
+
+    @property
+    def n_floating(self) -> int:
+        """Number of components that hold neither pin nor handle."""
+        return self.constraints.n_floating
+
+    def update(self, vertices: Float[Tensor, "n D"]) -> PoissonSolver:
+        """The solver of the same faces and constraints at other positions, factorised anew.
+
+        What depends on the faces alone is kept. (cholespy cannot keep the symbolic analysis.)
+
+        Args:
+            vertices: (n, D) new positions.
+        """
+        return PoissonSolver(self.mesh.with_vertices(vertices), **self._options)
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:
         """The solver of the disjoint union of the meshes, reusing their factors.
 
+        Pins, handles and floating components are those of the solvers in order.
+
         Raises:
-            ValueError: the solvers have different gauges.
+            ValueError: some solvers have the gauge "vertex" and others do not.
             MeshError: the meshes differ in dimension, dtype or device.
         """
-        gauges = {solver.gauge for solver in solvers}
-        if len(gauges) != 1:
-            raise ValueError(
-                f"PoissonSolver.concatenate: expected one common gauge, got {sorted(gauges)}"
-            )
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
-        starts = np.cumsum([0] + [solver.mesh.n_vertices for solver in solvers])
+        factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
+        union._options = {}
         union._assign(
             mesh,
-            gauges.pop(),
-            BlockDiagonal([solver._factor for solver in solvers]),
-            np.concatenate([s._free + start for s, start in zip(solvers, starts, strict=False)]),
-            sp.block_diag([solver._divergence_matrix for solver in solvers], format="csr"),
+            Constraints.concatenate([solver.constraints for solver in solvers]),
+            BlockDiagonal(factors),
+            sp.block_diag(divergences, format="csr"),
+            sp.block_diag(couplings, format="csr"),
         )
         return union
 
-    def __call__(self, R: Float[Tensor, "*batch m c k"]) -> Float[Tensor, "*batch n c"]:
+    def __call__(
+        self,
+        R: Float[Tensor, "*batch m c k"],
+        *,
+        pins: Float[Tensor, "*#batch p c"] | None = None,
+        handles: Float[Tensor, "*#batch h c"] | None = None,
+        translations: Float[Tensor, "*#batch q c"] | None = None,
+        transforms: Float[Tensor, "*#batch m c c"] | None = None,
+        vertices: Float[Tensor, "n D"] | None = None,
+        face_weights: Float[Tensor, "m"] | None = None,
+        order: int = 1,
+    ) -> Float[Tensor, "*batch n c"]:
         """The map whose Jacobians are closest to R in the area-weighted least-squares sense.
 
         Args:
-            R: (…, m, c, 2) in the coordinates of `mesh.frames`, or (…, m, c, D) on ambient vectors;
-                only their restriction to the tangent planes matters. float32 or float64; solved in
-                float64.
+            R: (…, m, c, d) in the coordinates of `mesh.frames`, or (…, m, c, D) on ambient vectors;
+                only their restriction to the tangent spaces matters. Solved in float64.
+            pins: (…, p, c) images of the pinned vertices, in the order given to the solver.
+            handles: (…, h, c) points that attract the handles, in the order given to the solver.
+            translations: (…, n_floating, c) where the gauge puts each component that is not held,
+                instead of zero.
+            transforms: (…, m, c, c) matrices that multiply those of R from the left.
+            vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
+            face_weights: (m,) the solver's own face weights again, if derivatives by them are
+                wanted.
+            order: up to which order derivatives by `vertices` and `face_weights` are exact; each
+                order costs one more solve. Higher derivatives are wrong, so do not take them.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
 
         Raises:
-            ValueError: R does not have one such matrix per face.
+            ValueError: shapes that do not fit; images missing for pins or handles, or given
+                without; `vertices` or `face_weights` that differ from those that were factorised.
         """
-        R = as_intrinsic("PoissonSolver", self.mesh, R)
-        b = self._divergence(matrices_to_columns(R.double()))
-        phi = self._fix_gauge(self._anchored(self._inverse(b)))
-        return columns_to_vertices(phi, R.shape).to(R.dtype)
+        geometry = self._moving_geometry(vertices, face_weights, order)
+        frames = self._frames if geometry is None else geometry.frames
+        intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
+        if transforms is not None:
+            intrinsic = transforms.double() @ intrinsic
+        batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
+        constraints = self.constraints
+        q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
+        q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
+        pull = constraints.handle_weights[:, None] * q_handles
+
+        b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
+        phi = self._scattered(self._inverse(b.index_add(0, self._handle_rows, pull)), q_pins)
+        means = self._mean_weights
+        if geometry is not None:
+            for _ in range(order):
+                residual = self._residual(geometry, face_weights, phi, intrinsic, pull)
+                phi = phi.index_add(0, constraints.free, self._inverse(residual))
+            means = constraints.mean_weights(geometry.vertex_measures())
+        phi = self._placed(phi, means, translations, batch, c)
+        return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
     def solve_laplacian(self, b: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        """The solution of L x = b that is zero at the vertex of lowest index of each component.
+        """The solution of L x = b that is zero at pins and at each component's anchor.
 
         Args:
-            b: (n, k) right-hand sides that sum to zero over each component, or no solution exists;
-                the rows of the anchors are not read.
+            b: (n, k) right-hand sides; over each floating component they must sum to zero, or no
+                solution exists. The rows of anchors and pins are not read.
         """
         if b.ndim != 2 or len(b) != self.mesh.n_vertices:
             raise ValueError(
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
                 f"got {tuple(b.shape)}"
             )
-        return self._anchored(self._inverse(b[self._free_index].double())).to(b.dtype)
+        x = self._inverse(b[self.constraints.free].double())
+        return self._scattered(x, x.new_zeros(len(self.constraints.pins), b.shape[1])).to(b.dtype)
 
-    def _anchored(self, x: Float[Tensor, "free k"]) -> Float[Tensor, "n k"]:
-        """Values at the free vertices, zero at the anchors."""
-        zeros = x.new_zeros(self.mesh.n_vertices, x.shape[1])
-        return zeros.index_copy(0, self._free_index, x)
+    # ---------------------------------------------------------------- steps of a solve
 
-    def _fix_gauge(self, phi: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-        if self.gauge == "vertex":
-            return phi  # the anchors are at zero already
-        means = phi.new_zeros(self.mesh.n_components, phi.shape[1])
-        means = means.index_add(0, self._labels, self._mean_weights[:, None] * phi)
-        return phi - means.index_select(0, self._labels)
+    def _given(
+        self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
+    ) -> Float[Tensor, "count k"]:
+        """Given images as columns; none for no constraints."""
+        if (values is None) != (count == 0):
+            verb = "missing" if values is None else "given"
+            raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
+        if values is None:
+            return self._frames.new_zeros(0, batch.numel() * c)
+        if values.shape[-2:] != (count, c):
+            raise ValueError(
+                f"PoissonSolver: expected {name} of shape (…, {count}, {c}), "
+                f"got {tuple(values.shape)}"
+            )
+        return vertices_to_columns(values.double().expand(*batch, count, c))
+
+    def _scattered(self, x: Tensor, q_pins: Tensor) -> Float[Tensor, "n k"]:
+        """Values at the free vertices and pins, zero at the anchors."""
+        phi = x.new_zeros(self.mesh.n_vertices, x.shape[1])
+        phi = phi.index_copy(0, self.constraints.free, x)
+        return phi.index_copy(0, self.constraints.pins, q_pins)
+
+    def _placed(
+        self,
+        phi: Float[Tensor, "n k"],
+        means: Float[Tensor, "n"] | None,
+        translations: Tensor | None,
+        batch: torch.Size,
+        c: int,
+    ) -> Float[Tensor, "n k"]:
+        """Move each floating component to where its gauge wants it."""
+        constraints = self.constraints
+        shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
+        if means is not None:
+            shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
+        if translations is not None:
+            q = self._given("floating components", translations, self.n_floating, batch, c)
+            shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
+        return phi + shifts.index_select(0, constraints.floating)
+
+    # ---------------------------------------------------------------- derivatives by the geometry
+
+    def _moving_geometry(
+        self, vertices: Tensor | None, face_weights: Tensor | None, order: int
+    ) -> CellGeometry | None:
+        """The geometry as a function of the given positions and weights; None if none is given."""
+        if vertices is None and face_weights is None:
+            return None
+        if order < 0:
+            raise ValueError(f"PoissonSolver: order must not be negative, got {order}")
+        own = (self.mesh.vertices, self.constraints.face_weights)
+        given = (vertices, face_weights)
+        for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
+            if yours is not None:
+                require_equal(
+                    yours.to(mine.dtype),
+                    mine,
+                    f"PoissonSolver: {name} differ from those that were factorised; solve with "
+                    "solver.update(vertices), or with a solver of these weights",
+                )
+        return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
+
+    def _residual(
+        self,
+        geometry: CellGeometry,
+        face_weights: Tensor | None,
+        phi: Float[Tensor, "n k"],
+        R: Float[Tensor, "*batch m c d"],
+        pull: Float[Tensor, "h k"],
+    ) -> Float[Tensor, "f k"]:
+        """b(v) - (L(v) + W) Φ at the free vertices."""
+        constraints = self.constraints
+        weights = constraints.face_weights if face_weights is None else face_weights.double()
+        misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
+        fit = vertices_to_columns(geometry.divergence(misfit, weights))
+        held = constraints.handle_weights[:, None] * phi[constraints.handles]
+        return fit.index_add(0, constraints.handles, pull - held)[constraints.free]
 
     def __repr__(self) -> str:
-        return f"PoissonSolver({self.mesh}, gauge={self.gauge!r})"
+        constraints = self.constraints
+        return (
+            f"PoissonSolver({self.mesh}, {len(constraints.pins)} pins, "
+            f"{len(constraints.handles)} handles, {self.n_floating} floating components)"
+        )
 
 
-def solve_poisson(
-    mesh: Mesh, R: Float[Tensor, "*batch m c k"], *, gauge: Gauge = "mean"
-) -> Float[Tensor, "*batch n c"]:
-    """One-shot `PoissonSolver(mesh, gauge=gauge)(R)`; keep the solver to solve more than once."""
-    return PoissonSolver(mesh, gauge=gauge)(R)
+def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) -> Tensor:
+    """One-shot `PoissonSolver(mesh, …)(R, …)`; keep the solver to solve more than once.
+
+    Args:
+        mesh: the domain.
+        R: (…, m, c, d) or (…, m, c, D) Jacobians.
+        options: those of `PoissonSolver`; `pins` and `handles` are pairs (indices, images).
+    """
+    images = {}
+    for name in ("pins", "handles"):
+        if options.get(name) is not None:
+            options[name], images[name] = options[name]
+    return PoissonSolver(mesh, **options)(R, **images)
 
 
-def _shares(sizes: Float[Tensor, "n"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Each size as a share of the total of its label."""
-    totals = sizes.new_zeros(int(labels.max()) + 1).index_add(0, labels, sizes)
-    return sizes / totals[labels]
-
-
-def _first_of_each(labels: np.ndarray) -> np.ndarray:
-    """Lowest index that carries each label."""
-    return np.unique(labels, return_index=True)[1]
+def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+    """∇ᵀA and L + W, float64, with the face weights in A."""
+    operator = gradient_operator(mesh)
+    divergence = operator.divergence_matrix
+    weights = constraints.face_weights.cpu().numpy()
+    if (weights != 1).any():
+        divergence = (divergence @ sp.diags(weights.repeat(mesh.cell_dim))).tocsr()
+    L = divergence @ operator.matrix
+    strengths = np.zeros(mesh.n_vertices)
+    strengths[constraints.handles.cpu().numpy()] = constraints.handle_weights.cpu().numpy()
+    return divergence, (L + sp.diags(strengths)).tocsr()

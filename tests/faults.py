@@ -18,7 +18,7 @@ import scipy.sparse as sp
 import torch
 from torch import Tensor
 
-from diffpoisson import gradient, linear_map, mesh, poisson
+from diffpoisson import cells, constraints, gradient, linear_map, mesh, poisson
 from tests.checks import CHECKS
 
 Patch = pytest.MonkeyPatch
@@ -61,13 +61,9 @@ def wrap_property(patch: Patch, owner: type, name: str, change: Callable[[Any, A
     patch.setattr(owner, name, property(lambda self: change(self, original(self))))
 
 
-def change_solver(patch: Patch, change: Callable[..., tuple]) -> None:
-    """Change (factor, free, divergence) when a solver is assembled."""
-
-    def assign(original, solver, mesh, gauge, *system):
-        return original(solver, mesh, gauge, *change(mesh, *system))
-
-    wrap_method(patch, poisson.PoissonSolver, "_assign", assign)
+def change_system(patch: Patch, change: Callable[..., tuple]) -> None:
+    """Change (∇ᵀA, L) when a solver assembles them."""
+    wrap(patch, poisson, "_assemble", lambda f, mesh, *rest: change(mesh, *f(mesh, *rest)))
 
 
 def wrap_method(patch: Patch, owner: type, name: str, wrapper: Callable) -> None:
@@ -85,13 +81,13 @@ def wrap_method(patch: Patch, owner: type, name: str, wrapper: Callable) -> None
 @fault("gradient_against_edge_basis")
 def swapped_hats(patch):
     """The gradients of two corners are exchanged."""
-    wrap(patch, gradient, "_hat_gradients", lambda hats, mesh: hats(mesh)[..., [0, 2, 1]])
+    wrap(patch, cells, "hat_gradients", lambda hats, *cell: hats(*cell)[..., [0, 2, 1]])
 
 
 @fault("reference")
 def negative_gradient(patch):
     """Edges are rotated the wrong way."""
-    wrap(patch, gradient, "_hat_gradients", lambda hats, mesh: -hats(mesh))
+    wrap(patch, cells, "hat_gradients", lambda hats, *cell: -hats(*cell))
 
 
 @fault("divergence_is_adjoint")
@@ -109,45 +105,46 @@ def unweighted_everywhere(patch):
 def unweighted_right_hand_side(patch):
     """Areas weigh the Laplacian but not the right-hand side."""
 
-    def change(mesh, factor, free, divergence):
-        return factor, free, divergence @ sp.diags(1 / mesh.areas.numpy().repeat(2))
+    def change(mesh, divergence, L):
+        return divergence @ sp.diags(1 / mesh.areas.numpy().repeat(2)), L
 
-    change_solver(patch, change)
+    change_system(patch, change)
 
 
 @fault("affine")
 def unweighted_laplacian(patch):
     """Areas weigh the right-hand side but not the Laplacian."""
-    wrap_property(
-        patch,
-        gradient.GradientOperator,
-        "laplacian",
-        lambda operator, _: (operator.matrix.T @ operator.matrix).tocsr(),
-    )
+
+    def change(mesh, divergence, L):
+        G = gradient.gradient_operator(mesh).matrix
+        return divergence, (G.T @ G).tocsr()
+
+    change_system(patch, change)
 
 
 @fault("affine")
 def double_areas(patch):
     """The right-hand side is weighed by doubled areas, as `doublearea` functions return them."""
-    change_solver(patch, lambda mesh, factor, free, divergence: (factor, free, 2 * divergence))
+    change_system(patch, lambda mesh, divergence, L: (2 * divergence, L))
 
 
 @fault("scale")
 def area_epsilon(patch):
     """A small number is added to areas, to avoid division by zero."""
-    wrap_property(patch, mesh.Mesh, "_double_areas", lambda _, areas: areas + 1e-8)
+    wrap(patch, cells, "measures", lambda f, corners: f(corners) + 1e-8)
 
 
 @fault("gradient_against_edge_basis")
 def unsigned_planar_areas(patch):
     """The orientation of clockwise planar faces is lost in the gradient."""
 
-    def hats(original, mesh):
-        if mesh.dim == 3:
-            return original(mesh)
-        return original(mesh) * mesh._doubled_area_vectors.sign()[:, None, None]
+    def hats(original, corners, frames):
+        values = original(corners, frames)
+        if corners.shape[2] == 3:
+            return values
+        return values * cells.determinants(corners).sign()[:, None, None]
 
-    wrap(patch, gradient, "_hat_gradients", hats)
+    wrap(patch, cells, "hat_gradients", hats)
 
 
 @fault("reference")
@@ -172,11 +169,11 @@ def relative_diagonal_shift(patch):
 def clamped_cotangents(patch):
     """Positive off-diagonal entries of the Laplacian (obtuse angles) are set to zero."""
 
-    def clamp(operator, L):
+    def clamp(mesh, divergence, L):
         off = (L - sp.diags(L.diagonal())).minimum(0)
-        return (off - sp.diags(np.asarray(off.sum(1)).ravel())).tocsr()
+        return divergence, (off - sp.diags(np.asarray(off.sum(1)).ravel())).tocsr()
 
-    wrap_property(patch, gradient.GradientOperator, "laplacian", clamp)
+    change_system(patch, clamp)
 
 
 # ------------------------------------------------------- conventions
@@ -186,8 +183,8 @@ def clamped_cotangents(patch):
 def transposed_jacobian(patch):
     """Rows and columns of the input are exchanged where that fits."""
 
-    def transpose(original, operation, mesh, R):
-        return original(operation, mesh, R.mT if R.shape[-1] == R.shape[-2] else R)
+    def transpose(original, operation, mesh, R, frames):
+        return original(operation, mesh, R.mT if R.shape[-1] == R.shape[-2] else R, frames)
 
     wrap(patch, poisson, "as_intrinsic", transpose)
 
@@ -196,9 +193,9 @@ def transposed_jacobian(patch):
 def ignored_frames(patch):
     """Intrinsic input is read in the frame of the face's second edge."""
 
-    def turn(original, operation, mesh, R):
+    def turn(original, operation, mesh, R, frames):
         if R.shape[-1] == mesh.dim:
-            return original(operation, mesh, R)
+            return original(operation, mesh, R, frames)
         edges = (mesh.vertices[mesh.faces[:, 2]] - mesh.vertices[mesh.faces[:, 1]])[:, None]
         x, y = torch.nn.functional.normalize((edges @ mesh.frames)[:, 0], dim=1).unbind(1)
         return R @ torch.stack([x, y, -y, x], dim=1).view(-1, 2, 2)
@@ -232,40 +229,47 @@ def mixed_batch(patch):
 @fault("mean_gauge")
 def plain_mean(patch):
     """The mean counts vertices, not areas."""
-    wrap(patch, poisson, "_shares", lambda f, sizes, labels: f(torch.ones_like(sizes), labels))
+    wrap_method(
+        patch,
+        constraints.Constraints,
+        "mean_weights",
+        lambda f, self, sizes: f(self, torch.ones_like(sizes)),
+    )
 
 
 @fault("mean_gauge")
 def global_mean(patch):
     """One mean over all components."""
 
-    def fix(original, solver, phi):
+    def place(_, solver, phi, *rest):
         areas = solver.mesh.vertex_areas[:, None]
         return phi - (areas * phi).sum(0) / areas.sum()
 
-    wrap_method(patch, poisson.PoissonSolver, "_fix_gauge", fix)
+    wrap_method(patch, poisson.PoissonSolver, "_placed", place)
 
 
 @fault("mean_gauge")
 def first_vertex_at_zero(patch):
     """The mean gauge is left out: the first vertex is at zero instead."""
-    wrap_method(patch, poisson.PoissonSolver, "_fix_gauge", lambda _, solver, phi: phi - phi[:1])
+    wrap_method(
+        patch, poisson.PoissonSolver, "_placed", lambda _, solver, phi, *rest: phi - phi[:1]
+    )
 
 
 @fault("backward")
 def detached_gauge(patch):
     """The mean is subtracted as a constant, outside the graph."""
 
-    def fix(original, solver, phi):
-        return phi + (original(solver, phi) - phi).detach()
+    def place(original, solver, phi, *rest):
+        return phi + (original(solver, phi, *rest) - phi).detach()
 
-    wrap_method(patch, poisson.PoissonSolver, "_fix_gauge", fix)
+    wrap_method(patch, poisson.PoissonSolver, "_placed", place)
 
 
 @fault("disconnected_as_each_alone")
 def one_anchor_for_all_components(patch):
     """Only the first component is pinned, and a tiny shift lets the factorisation pass."""
-    wrap(patch, poisson, "_first_of_each", lambda f, labels: f(labels)[:1])
+    wrap(patch, constraints, "_first_of_each", lambda f, labels, count: f(labels, count)[:1])
     wrap(patch, poisson, "CholeskyFactor", lambda f, L, device: f(L + 1e-10 * _eye(L), device))
 
 
@@ -273,7 +277,10 @@ def one_anchor_for_all_components(patch):
 def last_vertex_as_anchor(patch):
     """Another vertex than documented is pinned."""
     wrap(
-        patch, poisson, "_first_of_each", lambda f, labels: len(labels) - 1 - f(labels[::-1].copy())
+        patch,
+        constraints,
+        "_first_of_each",
+        lambda f, labels, count: len(labels) - 1 - f(labels.flip(0), count),
     )
 
 
@@ -318,9 +325,9 @@ def one_factor_for_all_parts(patch):
 def mutated_input(patch):
     """The caller's tensor is scaled in place, by a rounding or so."""
 
-    def mutate(original, operation, mesh, R):
+    def mutate(original, operation, mesh, R, frames):
         R.data.mul_(1 + 1e-12)
-        return original(operation, mesh, R)
+        return original(operation, mesh, R, frames)
 
     wrap(patch, poisson, "as_intrinsic", mutate)
 
@@ -329,9 +336,9 @@ def mutated_input(patch):
 def ignored_strides(patch):
     """The storage is read as if it were contiguous."""
 
-    def contiguous(original, operation, mesh, R):
+    def contiguous(original, operation, mesh, R, frames):
         strides = torch.empty(R.shape, device="meta").stride()
-        return original(operation, mesh, torch.as_strided(R, R.shape, strides))
+        return original(operation, mesh, torch.as_strided(R, R.shape, strides), frames)
 
     wrap(patch, poisson, "as_intrinsic", contiguous)
 

@@ -359,6 +359,6 @@ def test_batches(name, batch, c):
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.parametrize("shape", [(2,), (4, 2), (5, 2, 3), (1, 2)])
 def test_wrong_shapes_raise(name, shape, unchecked):
-    message = f"distortion: expected J of shape (…, 2, 2) or (…, 3, 2), got {shape}"
+    message = f"distortion: expected J of shape (…, 2, 2), (…, 3, 2) or (…, 3, 3), got {shape}"
     with pytest.raises(ValueError, match=re.escape(message)):
         getattr(dp, name)(torch.ones(shape))

@@ -38,12 +38,22 @@ REJECTED = {
     "geometry gradient": (
         torch.from_numpy(V).requires_grad_(),
         F,
-        "vertices require grad, but operators are constant in the geometry",
+        "vertices require grad, but a mesh is constant",
     ),
-    "quadrilaterals": (V, np.array([[0, 1, 2, 3]]), "faces must be (m, 3), got (1, 4); triangul"),
+    "planar quadrilaterals": (
+        V[:, :2],
+        np.array([[0, 1, 2, 3]]),
+        "tetrahedra, which need vertices (n, 3), got (4, 2)",
+    ),
     "float faces": (V, F.astype(float), "faces must have an integer dtype, got torch.float64"),
     "boolean faces": (V, F > 1, "faces must have an integer dtype, got torch.bool"),
-    "no faces": (V, F[:0], "no faces; an operator needs at least one triangle"),
+    "flat quadrilaterals": (
+        V * [1, 1, 0],
+        np.array([[0, 1, 2, 3]]),
+        "1 face [0] of zero volume (faces of four vertices are tetrahedra; triangulate quads)",
+    ),
+    "pentagons": (V, np.array([[0, 1, 2, 3, 0]]), "faces must be (m, 3), or (m, 4) for tetrah"),
+    "no faces": (V, F[:0], "no faces; an operator needs at least one cell"),
     "no vertices": (V[:0], F, "4 faces [0, 1, 2, 3] with a vertex index outside 0 … -1"),
     "index too large": (
         V,
@@ -192,7 +202,9 @@ def test_cleaned_raises_when_nothing_is_left():
         dp.Mesh.cleaned(V, np.array([[0, 0, 1], [0, 1, 9]]))
     with pytest.raises(dp.MeshError, match="none of the 1 faces is usable"):
         dp.Mesh.cleaned(V[:0], np.array([[0, 1, 2]]))
-    with pytest.raises(dp.MeshError, match=re.escape("faces must be (m, 3), got (4, 2)")):
+    with pytest.raises(
+        dp.MeshError, match=re.escape("faces must be (m, 3), or (m, 4) for tetrahedra, got (4, 2)")
+    ):
         dp.Mesh.cleaned(V, F[:, :2])
 
 

@@ -1,0 +1,112 @@
+"""Closed-form geometry of single cells: triangles in the plane or in space, tetrahedra.
+
+Pure functions of the corners' positions (m, k, D), differentiable any number of times; d = k - 1 is
+the dimension of the cell. Everything is computed in float64.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Corners = Float[Tensor, "m k D"]
+
+# The computed determinant of d edges of lengths |e| carries an absolute rounding error below c u
+# Π|e|, u the unit roundoff of float64: c = 8 for a cross product (two differences, two products and
+# one subtraction in each component), c = 16 for a triple product (one more product and sum, twice).
+# A cell whose determinant is smaller cannot be told from a flat one in float64.
+_DETERMINANT_ROUNDOFF = {2: 8 * 2.0**-53, 3: 16 * 2.0**-53}
+_FACTORIAL = {2: 2.0, 3: 6.0}
+
+
+def measures(corners: Corners) -> Float[Tensor, "m"]:
+    """Area of each triangle or volume of each tetrahedron, whatever its orientation."""
+    determinant = determinants(corners)
+    size = determinant.abs() if determinant.ndim == 1 else _norm(determinant)
+    return size / _FACTORIAL[corners.shape[1] - 1]
+
+
+def determinants(corners: Corners) -> Float[Tensor, "m *D"]:
+    """d! times the signed measure of each cell, (m,); as a normal vector, (m, 3), in space.
+
+    Taken at the corner with the shortest edges: all corners agree, but there a sliver loses the
+    fewest digits to cancellation.
+    """
+    return _determinant(_edges_at_best_corner(corners))
+
+
+def degenerate(corners: Corners) -> Bool[Tensor, "m"]:
+    """Cells whose measure is indistinguishable from zero in float64, at any scale."""
+    edges = _edges_at_best_corner(corners)
+    determinant = _determinant(edges)
+    size = determinant.abs() if determinant.ndim == 1 else _norm(determinant)
+    return size <= _DETERMINANT_ROUNDOFF[edges.shape[1]] * _norm(edges).prod(dim=1)
+
+
+def frames(corners: Corners) -> Float[Tensor, "m D d"]:
+    """Orthonormal basis of each cell's tangent space, as columns.
+
+    Of a triangle in space: along its first edge and across it, B₁ × B₂ = normal. Else the identity.
+    """
+    m, k, D = corners.shape
+    if k - 1 == D:
+        return torch.eye(D, dtype=corners.dtype, device=corners.device).expand(m, D, D)
+    first = corners[:, 1] - corners[:, 0]
+    x = first / _norm(first)[:, None]
+    normal = determinants(corners)
+    normal = normal / _norm(normal)[:, None]
+    return torch.stack([x, torch.linalg.cross(normal, x)], dim=2)
+
+
+def hat_gradients(corners: Corners, frames: Float[Tensor, "m D d"]) -> Float[Tensor, "m d k"]:
+    """Gradient ∇λᵢ of each corner's hat function, in coordinates of the frames.
+
+    ∇λᵢ is the inward normal of the facet opposite to corner i, of the length of that facet over d!
+    times the cell's measure: 1 / height.
+    """
+    determinant = determinants(corners)
+    if corners.shape[1] == 4:
+        return _facet_normals(corners).mT / determinant[:, None, None]
+    if determinant.ndim == 2:
+        determinant = _norm(determinant)  # frames are oriented like the face
+    opposite = corners.roll(1, dims=1) - corners.roll(-1, dims=1)  # e₀ = v₂ - v₁, …
+    x, y = (opposite @ frames).unbind(2)
+    return torch.stack([-y, x], dim=1) / determinant[:, None, None]  # e rotated by 90°
+
+
+def _edges_at_best_corner(corners: Corners) -> Float[Tensor, "m d D"]:
+    """The d edges that leave the corner where the product of their lengths is least, in order."""
+    m, k, _ = corners.shape
+    edges = corners[:, None, :, :] - corners[:, :, None, :]  # from corner i to corner j
+    # The other corners in an order that keeps the orientation.
+    others = torch.tensor(_OTHERS[k], device=corners.device)
+    edges = edges[:, torch.arange(k, device=corners.device)[:, None], others]  # (m, k, d, D)
+    best = _norm(edges.detach()).prod(dim=2).argmin(dim=1)
+    return edges[torch.arange(m, device=corners.device), best]
+
+
+_OTHERS = {
+    3: ((1, 2), (2, 0), (0, 1)),
+    4: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)),
+}
+
+
+def _determinant(edges: Float[Tensor, "m d D"]) -> Float[Tensor, "m *D"]:
+    a, b = edges[:, 0], edges[:, 1]
+    if edges.shape[1] == 3:
+        return (torch.linalg.cross(a, b) * edges[:, 2]).sum(-1)
+    if edges.shape[2] == 3:
+        return torch.linalg.cross(a, b)
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _facet_normals(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3"]:
+    """Twice the area vector of the facet opposite to each corner, inward if positively oriented."""
+    others = torch.tensor(_OTHERS[4], device=corners.device)
+    a, b, c = corners[:, others].unbind(2)
+    return -torch.linalg.cross(b - a, c - a)
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vectors, dim=-1)

@@ -105,8 +105,9 @@ class _Handle:
         itself. (Without a solve before, that call would crash.)
         """
         if self._has_work_space:
-            nothing = torch.empty(self._n, 0, dtype=torch.float64)
-            self._solver.solve(nothing, torch.empty_like(nothing))
+            # NumPy's: garbage is collected at any time, also inside a transform that wraps tensors.
+            nothing = np.empty((self._n, 0))
+            self._solver.solve(nothing, np.empty_like(nothing))
         self._solver = None
 
 

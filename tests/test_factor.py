@@ -82,6 +82,19 @@ def test_a_factor_may_go_unused():
     CholeskyFactor(spd())
 
 
+def test_a_factor_may_be_collected_inside_a_transform():
+    """Garbage goes at any time; its clean-up must not meet the transform's own tensors."""
+    factors = [CholeskyFactor(spd())]
+    factors[0].multiply(columns())
+
+    def collect(x: torch.Tensor) -> torch.Tensor:
+        factors.clear()
+        gc.collect()  # pytest fails the test for an error in the clean-up
+        return x
+
+    torch.func.jvp(collect, (torch.ones(3),), (torch.ones(3),))
+
+
 # ------------------------------------------------------- what is refused
 
 

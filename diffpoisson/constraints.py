@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import topology
+from diffpoisson.arguments import to_tensor
 from diffpoisson.mesh import Mesh, describe_indices
 
 Gauge = Literal["mean", "vertex"]
@@ -138,7 +139,7 @@ def _vertex_indices(mesh: Mesh, name: str, indices: Tensor | None) -> Int[Tensor
     """Distinct vertex indices on the mesh's device, from indices or a mask over the vertices."""
     if indices is None:
         return torch.zeros(0, dtype=torch.int64, device=mesh.device)
-    indices = torch.as_tensor(indices, device=mesh.device)
+    indices = to_tensor("PoissonSolver", name, indices, mesh.device)
     if indices.dtype == torch.bool and indices.shape == (mesh.n_vertices,):
         return indices.nonzero()[:, 0]
     if indices.ndim != 1 or indices.dtype not in (torch.int32, torch.int64):
@@ -159,7 +160,7 @@ def _vertex_indices(mesh: Mesh, name: str, indices: Tensor | None) -> Int[Tensor
 
 
 def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Tensor, "h"]:
-    strengths = torch.as_tensor(weights, dtype=torch.float64, device=mesh.device)
+    strengths = to_tensor("PoissonSolver", "handle_weights", weights, mesh.device).double()
     if strengths.shape not in ((), handles.shape):
         _fail(
             f"handle_weights must be a number or of shape ({len(handles)},), got "
@@ -174,7 +175,7 @@ def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Te
 def _face_weights(mesh: Mesh, weights: Tensor | None) -> Float[Tensor, "m"]:
     if weights is None:
         return torch.ones(mesh.n_faces, dtype=torch.float64, device=mesh.device)
-    weights = torch.as_tensor(weights, device=mesh.device).detach().double()
+    weights = to_tensor("PoissonSolver", "face_weights", weights, mesh.device).detach().double()
     if weights.shape != (mesh.n_faces,):
         _fail(f"face_weights must be of shape (m={mesh.n_faces},), got {tuple(weights.shape)}")
     bad = ~((weights >= 0) & weights.isfinite())

@@ -22,6 +22,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_number, require_tensor
+
 Jacobian = Float[Tensor, "*batch c d"]
 Density = Float[Tensor, "*batch"]
 
@@ -139,6 +141,7 @@ def isometric_amips(
 
 def _shape(J: Tensor) -> tuple[int, int]:
     """(c, d), one of the three supported."""
+    require_tensor("distortion", "J", J)
     shape = (J.shape[-2], J.shape[-1]) if J.ndim >= 2 else (0, 0)
     if shape not in ((2, 2), (3, 2), (3, 3)):
         raise ValueError(
@@ -193,8 +196,7 @@ def _sqrt(x: Tensor) -> Tensor:
 
 def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:
     """χ(det J); for ε = 0 det J itself, and +∞ (a constant) where it is not positive."""
-    if epsilon < 0:
-        raise ValueError(f"distortion: epsilon must not be negative, got {epsilon}")
+    require_number("distortion", "epsilon", epsilon)
     det = determinant(J)
     if epsilon == 0:
         # Infinity keeps the denominators it ends up in, and their derivatives, free of 0/0.

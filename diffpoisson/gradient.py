@@ -20,8 +20,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson import cells
+from diffpoisson.arguments import require_single_or_double, require_tensor
 from diffpoisson.linear_map import LinearMap, Matrix
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_mesh
 from diffpoisson.restriction import extend, restrict
 
 
@@ -131,8 +132,10 @@ def jacobians(
         direction. Dimensionless if the image has the mesh's units. In the dtype of phi.
 
     Raises:
-        ValueError: phi does not have one row per vertex.
+        ValueError: phi does not have one row per vertex, or is on another device.
+        TypeError: phi is not a float32 or float64 tensor.
     """
+    _require_fields("jacobians", mesh, phi=phi, vertices=vertices)
     if phi.ndim < 2 or phi.shape[-2] != mesh.n_vertices:
         raise ValueError(
             f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
@@ -163,8 +166,10 @@ def divergence(
             stays what it is in the coordinates of the moving frames.
 
     Raises:
-        ValueError: R does not have one such matrix per face.
+        ValueError: R does not have one such matrix per face, or is on another device.
+        TypeError: R is not a float32 or float64 tensor.
     """
+    _require_fields("divergence", mesh, R=R, vertices=vertices)
     if vertices is not None:
         geometry = CellGeometry.at(mesh, vertices)
         intrinsic = as_intrinsic("divergence", mesh, R.double(), geometry.frames)
@@ -176,7 +181,16 @@ def divergence(
 
 def laplacian(mesh: Mesh) -> sp.csr_matrix:
     """The cotangent Laplacian L = ∇ᵀA∇, (n, n), symmetric positive semi-definite, float64."""
+    require_mesh("laplacian", mesh)
     return gradient_operator(mesh).laplacian.copy()
+
+
+def _require_fields(operation: str, mesh: Mesh, **fields: Tensor | None) -> None:
+    require_mesh(operation, mesh)
+    for name, value in fields.items():
+        if value is not None:
+            require_tensor(operation, name, value, mesh.device)
+            require_single_or_double(operation, name, value)
 
 
 def as_intrinsic(

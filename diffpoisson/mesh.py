@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells, topology
+from diffpoisson.arguments import require_tensor
 
 ArrayLike = Tensor | np.ndarray
 
@@ -140,6 +141,7 @@ class Mesh:
         Raises:
             MeshError: as for a new mesh, or another shape, dtype or device than before.
         """
+        require_tensor("Mesh.with_vertices", "vertices", vertices)
         before = (self.vertices.shape, self.dtype, self.device)
         if (vertices.shape, vertices.dtype, vertices.device) != before:
             raise MeshError(
@@ -327,8 +329,10 @@ class Mesh:
         Parts keep their order: `split_vertices` and `split_faces` take per-vertex and per-face
         values of the union apart again.
         """
-        if not meshes:
+        if len(meshes) == 0:
             raise MeshError("Mesh.concatenate: needs at least one mesh")
+        for mesh in meshes:
+            require_mesh("Mesh.concatenate", mesh)
         kinds = sorted({f"D={m.dim} d={m.cell_dim} {m.dtype} {m.device}" for m in meshes})
         if len(kinds) > 1:
             raise MeshError(
@@ -361,11 +365,11 @@ class Mesh:
 
     def split_vertices(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
         """Per-vertex values of a concatenated mesh, cut along `dim` into one tensor per part."""
-        return values.split(np.diff(self.vertex_offsets).tolist(), dim)
+        return _split("Mesh.split_vertices", values, self.vertex_offsets, dim)
 
     def split_faces(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
         """Per-face values of a concatenated mesh, cut along `dim` into one tensor per part."""
-        return values.split(np.diff(self.face_offsets).tolist(), dim)
+        return _split("Mesh.split_faces", values, self.face_offsets, dim)
 
     # ---------------------------------------------------------------- repair
 
@@ -410,6 +414,15 @@ class Mesh:
 # -------------------------------------------------------------------- validation
 
 
+def require_mesh(operation: str, mesh: object) -> None:
+    """Raise TypeError for anything but a `Mesh`, such as another library's."""
+    if not isinstance(mesh, Mesh):
+        raise TypeError(
+            f"{operation}: expected a diffpoisson.Mesh, got {type(mesh).__name__}; build one with "
+            "Mesh(vertices, faces)"
+        )
+
+
 def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     try:
         vertices, faces = _as_tensor(vertices), _as_tensor(faces)
@@ -435,6 +448,12 @@ def _is_integer(values: Tensor) -> bool:
 
 def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
     """Shapes and dtypes: what even `Mesh.cleaned` cannot repair."""
+    for name, values in (("vertices", vertices), ("faces", faces)):
+        if values.layout != torch.strided or values.is_meta:
+            raise MeshError(
+                f"Mesh: {name} must be a dense tensor with values, got {values.layout} on "
+                f"{values.device}"
+            )
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
         raise MeshError(f"Mesh: vertices must be (n, 2) or (n, 3), got {tuple(vertices.shape)}")
     if vertices.dtype not in (torch.float32, torch.float64):
@@ -520,6 +539,18 @@ def _repeated(faces: Int[Tensor, "m k"]) -> Bool[Tensor, "m"]:
 
 
 # -------------------------------------------------------------------- indices
+
+
+def _split(
+    operation: str, values: Tensor, offsets: tuple[int, ...], dim: int
+) -> tuple[Tensor, ...]:
+    if not isinstance(values, Tensor):
+        raise TypeError(f"{operation}: values must be a torch tensor, got {type(values).__name__}")
+    if not -values.ndim <= dim < values.ndim or values.shape[dim] != offsets[-1]:
+        raise ValueError(
+            f"{operation}: expected {offsets[-1]} values along dim {dim}, got {tuple(values.shape)}"
+        )
+    return values.split(np.diff(offsets).tolist(), dim)
 
 
 def _concatenate_offsets(parts: Sequence[tuple[int, ...]]) -> tuple[int, ...]:

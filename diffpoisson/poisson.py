@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffpoisson.arguments import require_count, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -40,7 +41,7 @@ from diffpoisson.gradient import (
     vertices_to_columns,
 )
 from diffpoisson.linear_map import LinearMap, Matrix, require_equal
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_mesh
 
 
 class PoissonSolver:
@@ -78,6 +79,7 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
+        require_mesh("PoissonSolver", mesh)
         self._options: dict[str, Any] = {
             "gauge": gauge,
             "pins": pins,
@@ -185,11 +187,12 @@ class PoissonSolver:
             ValueError: shapes that do not fit; images missing for pins or handles, or given
                 without; `vertices` or `face_weights` that differ from those that were factorised.
         """
+        require_tensor("PoissonSolver", "R", R, self.mesh.device)
         geometry = self._moving_geometry(vertices, face_weights, order)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
         if transforms is not None:
-            intrinsic = transforms.double() @ intrinsic
+            intrinsic = self._transformed(transforms, intrinsic)
         batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
@@ -214,6 +217,7 @@ class PoissonSolver:
             b: (n, k) right-hand sides; over each floating component they must sum to zero, or no
                 solution exists. The rows of anchors and pins are not read.
         """
+        require_tensor("solve_laplacian", "b", b, self.mesh.device)
         if b.ndim != 2 or len(b) != self.mesh.n_vertices:
             raise ValueError(
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
@@ -233,12 +237,27 @@ class PoissonSolver:
             raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
         if values is None:
             return self._frames.new_zeros(0, batch.numel() * c)
-        if values.shape[-2:] != (count, c):
+        require_tensor("PoissonSolver", name, values, self.mesh.device)
+        if values.shape[-2:] != (count, c) or not _expands(values.shape[:-2], batch):
             raise ValueError(
-                f"PoissonSolver: expected {name} of shape (…, {count}, {c}), "
-                f"got {tuple(values.shape)}"
+                f"PoissonSolver: expected {name} of shape (…, {count}, {c}), the … broadcasting "
+                f"to {tuple(batch)}, got {tuple(values.shape)}"
             )
         return vertices_to_columns(values.double().expand(*batch, count, c))
+
+    def _transformed(
+        self, transforms: Tensor, R: Float[Tensor, "*batch m c d"]
+    ) -> Float[Tensor, "*batch m c d"]:
+        """The transforms times R."""
+        require_tensor("PoissonSolver", "transforms", transforms, self.mesh.device)
+        m, c = R.shape[-3:-1]
+        both = zip(transforms.shape[-4::-1], R.shape[-4::-1], strict=False)
+        if transforms.shape[-3:] != (m, c, c) or any(a != b and 1 not in (a, b) for a, b in both):
+            raise ValueError(
+                f"PoissonSolver: expected transforms of shape (…, m={m}, {c}, {c}), the … "
+                f"broadcasting with {tuple(R.shape[:-3])}, got {tuple(transforms.shape)}"
+            )
+        return transforms.double() @ R
 
     def _scattered(self, x: Tensor, q_pins: Tensor) -> Float[Tensor, "n k"]:
         """Values at the free vertices and pins, zero at the anchors."""
@@ -259,9 +278,12 @@ class PoissonSolver:
         shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
+        shifts = shifts[:-1]
         if translations is not None:
             q = self._given("floating components", translations, self.n_floating, batch, c)
-            shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
+            shifts = shifts + q
+        # What is held does not move, nor catches a NaN (weighed by zero) from other components.
+        shifts = torch.cat([shifts, shifts.new_zeros(1, shifts.shape[1])])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
@@ -272,12 +294,12 @@ class PoissonSolver:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        if order < 0:
-            raise ValueError(f"PoissonSolver: order must not be negative, got {order}")
+        require_count("PoissonSolver", "order", order)
         own = (self.mesh.vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
+                require_tensor("PoissonSolver", name, yours, self.mesh.device)
                 require_equal(
                     yours.to(mine.dtype),
                     mine,
@@ -323,6 +345,12 @@ def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) 
         if options.get(name) is not None:
             options[name], images[name] = options[name]
     return PoissonSolver(mesh, **options)(R, **images)
+
+
+def _expands(shape: torch.Size, batch: torch.Size) -> bool:
+    """Whether dimensions broadcast to given ones, without changing those."""
+    pairs = zip(reversed(shape), reversed(batch), strict=False)
+    return len(shape) <= len(batch) and all(size in (1, total) for size, total in pairs)
 
 
 def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.csr_matrix]:

@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_count, to_tensor
 from diffpoisson.gradient import laplacian
-from diffpoisson.mesh import Mesh, MeshError
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.poisson import PoissonSolver
 
 Mass = Literal["barycentric", "voronoi"]
@@ -51,6 +52,8 @@ def laplacian_eigenpairs(
         MeshError: the mesh has fewer than k vertices.
         ValueError: the solver is another mesh's.
     """
+    require_mesh("laplacian_eigenpairs", mesh)
+    require_count("laplacian_eigenpairs", "n_eigenpairs", n_eigenpairs)
     n, zeros = mesh.n_vertices, mesh.n_components
     if not 1 <= n_eigenpairs <= n:
         raise MeshError(
@@ -79,6 +82,7 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
     Raises:
         ValueError: unknown kind of mass.
     """
+    require_mesh("lumped_mass", mesh)
     if mass == "barycentric":
         return mesh.vertex_areas
     if mass != "voronoi":
@@ -116,6 +120,7 @@ def wave_kernel_signature(
     Raises:
         MeshError: too few vertices, or no two different non-zero eigenvalues, for this spectrum.
     """
+    require_count("wave_kernel_signature", "n_energies", n_energies, least=1)
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
     log_values = values[mesh.n_components :].double().log()
     if len(log_values) < 2 or log_values[0] == log_values[-1]:
@@ -147,11 +152,21 @@ def heat_kernel_signature(
 
     Args:
         mesh: the surface.
-        times: (t,) diffusion times, in units².
+        times: (t,) diffusion times, in units², not negative.
         n_eigenpairs: size of the truncated spectrum, counting the zero eigenvalues.
         mass: see `laplacian_eigenpairs`.
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+
+    Raises:
+        ValueError: negative times.
     """
+    require_mesh("heat_kernel_signature", mesh)
+    times = to_tensor("heat_kernel_signature", "times", times, mesh.device)
+    if times.ndim != 1 or not (times >= 0).all():
+        raise ValueError(
+            "heat_kernel_signature: times must be (t,) and not negative, got shape "
+            f"{tuple(times.shape)}"
+        )
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
     return vectors**2 @ torch.exp(-values[:, None] * times.to(values)[None])
 

@@ -78,14 +78,14 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
-        self._options: dict[str, Any] = {
-            "gauge": gauge,
-            "pins": pins,
-            "handles": handles,
-            "handle_weights": handle_weights,
-            "face_weights": face_weights,
-        }
-        constraints = Constraints.build(mesh, **self._options)
+        constraints = Constraints.build(
+            mesh,
+            gauge=gauge,
+            pins=pins,
+            handles=handles,
+            handle_weights=handle_weights,
+            face_weights=face_weights,
+        )
         free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
         divergence, L = _assemble(mesh, constraints)
         factor = CholeskyFactor(L[free][:, free], mesh.device)
@@ -125,7 +125,15 @@ class PoissonSolver:
         Args:
             vertices: (n, D) new positions.
         """
-        return PoissonSolver(self.mesh.with_vertices(vertices), **self._options)
+        constraints = self.constraints
+        return PoissonSolver(
+            self.mesh.with_vertices(vertices),
+            gauge="vertex" if constraints.gauge_mask is None else constraints.gauge_mask,
+            pins=constraints.pins,
+            handles=constraints.handles,
+            handle_weights=constraints.handle_weights,
+            face_weights=constraints.face_weights,
+        )
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:
@@ -140,7 +148,6 @@ class PoissonSolver:
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
-        union._options = {}
         union._assign(
             mesh,
             Constraints.concatenate([solver.constraints for solver in solvers]),

@@ -216,3 +216,17 @@ def test_repr():
     solver = dp.PoissonSolver(dp.Mesh(*meshes.triangle()), gauge="vertex")
     assert repr(solver).startswith("PoissonSolver(Mesh(n_vertices=3")
     assert repr(solver).endswith("0 pins, 0 handles, 1 floating components)")
+
+
+def test_updating_a_union_keeps_its_constraints():
+    """The union of a pinned and a free solver, moved, is the union of both moved."""
+    pinned = dp.PoissonSolver(dp.Mesh(*meshes.disk()), pins=torch.tensor([3, 0]))
+    free = dp.PoissonSolver(dp.Mesh(*meshes.sphere()))
+    moved = [2 * solver.mesh.vertices.sin() + solver.mesh.vertices for solver in (pinned, free)]
+    union = dp.PoissonSolver.concatenate([pinned, free]).update(torch.cat(moved))
+    R, images = field(union.mesh), torch.from_numpy(np.random.default_rng(1).random((2, 3)))
+    expected = [
+        pinned.update(moved[0])(R[: pinned.mesh.n_faces], pins=images),
+        free.update(moved[1])(R[pinned.mesh.n_faces :]),
+    ]
+    assert_near(union(R, pins=images), torch.cat(expected), SOLVE)

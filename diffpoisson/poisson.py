@@ -39,8 +39,9 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix, require_equal
+from diffpoisson.linear_map import LinearMap, Matrix
 from diffpoisson.mesh import Mesh
+from diffpoisson.transforms import outside_transforms, require_equal
 
 
 class PoissonSolver:
@@ -78,18 +79,19 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
-        constraints = Constraints.build(
-            mesh,
-            gauge=gauge,
-            pins=pins,
-            handles=handles,
-            handle_weights=handle_weights,
-            face_weights=face_weights,
-        )
-        free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
-        divergence, L = _assemble(mesh, constraints)
-        factor = CholeskyFactor(L[free][:, free], mesh.device)
-        self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+        with outside_transforms():
+            constraints = Constraints.build(
+                mesh,
+                gauge=gauge,
+                pins=pins,
+                handles=handles,
+                handle_weights=handle_weights,
+                face_weights=face_weights,
+            )
+            free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
+            divergence, L = _assemble(mesh, constraints)
+            factor = CholeskyFactor(L[free][:, free], mesh.device)
+            self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
         self,
@@ -237,12 +239,15 @@ class PoissonSolver:
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
     ) -> Float[Tensor, "count k"] | None:
-        """Given images as columns; None for no constraints."""
+        """Given images as columns; None if there are none to give."""
         if (values is None) != (count == 0):
             verb = "missing" if values is None else "given"
             raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
-        if values is None:
-            return None
+        return None if values is None else self._columns(name, values, count, batch, c)
+
+    def _columns(
+        self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
+    ) -> Float[Tensor, "count k"]:
         if values.shape[-2:] != (count, c):
             raise ValueError(
                 f"PoissonSolver: expected {name} of shape (…, {count}, {c}), "
@@ -272,8 +277,8 @@ class PoissonSolver:
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
         if translations is not None:
-            q = self._given("floating components", translations, self.n_floating, batch, c)
-            shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
+            q = self._columns("translations", translations, self.n_floating, batch, c)
+            shifts = torch.cat([shifts[:-1] + q, shifts[-1:]])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry

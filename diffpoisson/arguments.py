@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 import numbers
 import operator
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,6 +47,11 @@ def require_single_or_double(operation: str, name: str, value: Tensor) -> None:
         )
 
 
+def as_tensor(value: object, device: torch.device | None = None) -> Tensor:
+    """`torch.as_tensor`, also of arrays that torch cannot share: read-only, or flipped views."""
+    return torch.as_tensor(value.copy() if isinstance(value, np.ndarray) else value, device=device)
+
+
 def to_tensor(operation: str, name: str, value: object, device: torch.device) -> Tensor:
     """A tensor on a device of anything numeric and real.
 
@@ -52,7 +59,7 @@ def to_tensor(operation: str, name: str, value: object, device: torch.device) ->
         TypeError: not numeric, complex, or without values.
     """
     try:
-        tensor = torch.as_tensor(value, device=device)
+        tensor = as_tensor(value, device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{operation}: {name} must be numeric: {error}") from error
     if tensor.is_complex() or tensor.layout != torch.strided:
@@ -62,8 +69,22 @@ def to_tensor(operation: str, name: str, value: object, device: torch.device) ->
     return tensor
 
 
-def require_count(operation: str, name: str, value: object, least: int = 0) -> None:
-    """Raise unless a value is an integer not below the least.
+def require_instances(operation: str, values: object, kind: type) -> None:
+    """Raise TypeError unless values are a sequence of instances of a class."""
+    if not isinstance(values, Sequence):
+        raise TypeError(
+            f"{operation}: expected a list of {kind.__name__}, got {type(values).__name__}"
+        )
+    for i, value in enumerate(values):
+        if not isinstance(value, kind):
+            raise TypeError(
+                f"{operation}: expected a list of {kind.__name__}, but entry {i} is of type "
+                f"{type(value).__name__}"
+            )
+
+
+def require_integer(operation: str, name: str, value: object, least: int | None = None) -> None:
+    """Raise unless a value is an integer, and not below the least if that is given.
 
     Raises:
         TypeError: not an integer.
@@ -71,11 +92,13 @@ def require_count(operation: str, name: str, value: object, least: int = 0) -> N
     """
     try:
         count = operator.index(value)  # type: ignore[arg-type]
+        if isinstance(value, bool):
+            raise TypeError
     except TypeError:
         raise TypeError(
             f"{operation}: {name} must be an integer, got {type(value).__name__}"
         ) from None
-    if count < least:
+    if least is not None and count < least:
         raise ValueError(f"{operation}: {name} must be at least {least}, got {count}")
 
 

@@ -206,7 +206,8 @@ def _labels(mesh: Mesh, weights: Tensor, pins: Tensor) -> Int[Tensor, "n"]:
 def _gauge_mask(
     mesh: Mesh, gauge: Gauge | Tensor, floating: Tensor, n_floating: int
 ) -> Bool[Tensor, "n"] | None:
-    if isinstance(gauge, Tensor):
+    if not isinstance(gauge, str):
+        gauge = to_tensor("PoissonSolver", "a gauge mask", gauge, mesh.device)
         if gauge.shape != (mesh.n_vertices,) or gauge.dtype != torch.bool:
             _fail(
                 f"a gauge mask must be (n={mesh.n_vertices},) bool, got {tuple(gauge.shape)} "

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from functools import cached_property
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -22,8 +21,9 @@ from torch import Tensor
 from diffpoisson import cells
 from diffpoisson.arguments import require_single_or_double, require_tensor
 from diffpoisson.linear_map import LinearMap, Matrix
-from diffpoisson.mesh import Mesh, require_mesh
+from diffpoisson.mesh import Mesh, require_cells, require_mesh
 from diffpoisson.restriction import extend, restrict
+from diffpoisson.transforms import concrete, constant_property, outside_transforms
 
 
 class SparseMatrix(Matrix):
@@ -89,13 +89,13 @@ class GradientOperator:
         self.adjoint = self.gradient.T
         self.weights = mesh._double_measures.repeat_interleave(mesh.cell_dim)[:, None]
 
-    @cached_property
+    @constant_property
     def divergence_matrix(self) -> sp.csr_matrix:
         """∇ᵀA as a SciPy matrix (n, m·d)."""
         weights = self.weights[:, 0].cpu().numpy()
         return (sp.diags(weights) @ self.matrix).T.tocsr()
 
-    @cached_property
+    @constant_property
     def laplacian(self) -> sp.csr_matrix:
         """L = ∇ᵀA∇ as a SciPy matrix (n, n)."""
         return (self.divergence_matrix @ self.matrix).tocsr()
@@ -107,7 +107,8 @@ _operators: WeakKeyDictionary[Mesh, GradientOperator] = WeakKeyDictionary()
 def gradient_operator(mesh: Mesh) -> GradientOperator:
     """The mesh's operators, assembled at the first call and kept as long as the mesh lives."""
     if mesh not in _operators:
-        _operators[mesh] = GradientOperator(mesh)
+        with outside_transforms():
+            _operators[mesh] = GradientOperator(mesh)
     return _operators[mesh]
 
 
@@ -124,7 +125,8 @@ def jacobians(
         mesh: the domain.
         phi: (…, n, c) float32 or float64 image of each vertex, c output coordinates.
         extrinsic: return J Bᵀ, acting on ambient vectors (zero along the normal), instead of J.
-        vertices: (n, D) positions to use instead of the mesh's, to differentiate by.
+        vertices: (n, D) positions to use instead of the mesh's, to differentiate by. (Under vmap
+            and torch.compile they are not checked, and flat cells give infinities or NaN.)
 
     Returns:
         (…, m, c, d) in the coordinates of the faces' frames, d = 2 for triangles and 3 for
@@ -134,8 +136,9 @@ def jacobians(
     Raises:
         ValueError: phi does not have one row per vertex, or is on another device.
         TypeError: phi is not a float32 or float64 tensor.
+        MeshError: a cell is flat at the given positions.
     """
-    _require_fields("jacobians", mesh, phi=phi, vertices=vertices)
+    _require("jacobians", mesh, "phi", phi, vertices)
     if phi.ndim < 2 or phi.shape[-2] != mesh.n_vertices:
         raise ValueError(
             f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
@@ -168,8 +171,9 @@ def divergence(
     Raises:
         ValueError: R does not have one such matrix per face, or is on another device.
         TypeError: R is not a float32 or float64 tensor.
+        MeshError: a cell is flat at the given positions.
     """
-    _require_fields("divergence", mesh, R=R, vertices=vertices)
+    _require("divergence", mesh, "R", R, vertices)
     if vertices is not None:
         geometry = CellGeometry.at(mesh, vertices)
         intrinsic = as_intrinsic("divergence", mesh, R.double(), geometry.frames)
@@ -185,12 +189,19 @@ def laplacian(mesh: Mesh) -> sp.csr_matrix:
     return gradient_operator(mesh).laplacian.copy()
 
 
-def _require_fields(operation: str, mesh: Mesh, **fields: Tensor | None) -> None:
+def _require(operation: str, mesh: Mesh, name: str, field: Tensor, vertices: Tensor | None) -> None:
     require_mesh(operation, mesh)
-    for name, value in fields.items():
-        if value is not None:
-            require_tensor(operation, name, value, mesh.device)
-            require_single_or_double(operation, name, value)
+    require_tensor(operation, name, field, mesh.device)
+    require_single_or_double(operation, name, field)
+    if vertices is not None:
+        require_tensor(operation, "vertices", vertices, mesh.device)
+        require_single_or_double(operation, "vertices", vertices)
+        if vertices.shape != mesh.vertices.shape:
+            raise ValueError(
+                f"{operation}: expected vertices of shape {tuple(mesh.vertices.shape)}, "
+                f"got {tuple(vertices.shape)}"
+            )
+        require_cells(operation, concrete(vertices), mesh.faces)
 
 
 def as_intrinsic(
@@ -225,11 +236,6 @@ class CellGeometry(NamedTuple):
     @classmethod
     def at(cls, mesh: Mesh, vertices: Float[Tensor, "n D"]) -> CellGeometry:
         """The geometry of a mesh's cells at other positions, in float64."""
-        if vertices.shape != mesh.vertices.shape:
-            raise ValueError(
-                f"expected vertices of shape {tuple(mesh.vertices.shape)}, "
-                f"got {tuple(vertices.shape)}"
-            )
         corners = vertices.double()[mesh.faces]
         frames = cells.frames(corners)
         hats = cells.hat_gradients(corners, frames)

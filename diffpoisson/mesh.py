@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -12,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells, topology
-from diffpoisson.arguments import require_tensor
+from diffpoisson.arguments import as_tensor, require_instances, require_integer, require_tensor
+from diffpoisson.transforms import constant_property, is_transformed, outside_transforms
 
 ArrayLike = Tensor | np.ndarray
 
@@ -72,10 +72,12 @@ class Mesh:
     face_offsets: tuple[int, ...]
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        vertices, faces = _as_tensors(vertices, faces)
-        _validate(vertices, faces)
-        # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
-        self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
+        _require_constant(vertices)
+        with outside_transforms():
+            vertices, faces = _as_tensors(vertices, faces)
+            _validate(vertices, faces)
+            # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
+            self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
 
     def _assign(
         self,
@@ -148,6 +150,7 @@ class Mesh:
                 f"Mesh.with_vertices: expected {tuple(self.vertices.shape)} {self.dtype} on "
                 f"{self.device}, got {tuple(vertices.shape)} {vertices.dtype} on {vertices.device}"
             )
+        _require_constant(vertices)
         _validate(vertices, self.faces)
         moved = object.__new__(Mesh)
         moved._assign(vertices.clone(), self.faces, self.vertex_offsets, self.face_offsets)
@@ -157,6 +160,8 @@ class Mesh:
 
     def to(self, target: torch.dtype | torch.device | str) -> Mesh:
         """The same mesh in another floating dtype or on another device."""
+        if not isinstance(target, torch.dtype):
+            target = _as_device(target)
         moved = object.__new__(Mesh)
         faces = self.faces if isinstance(target, torch.dtype) else self.faces.to(target)
         vertices = self.vertices.to(target)
@@ -166,22 +171,22 @@ class Mesh:
 
     # ---------------------------------------------------------------- geometry
 
-    @cached_property
+    @constant_property
     def _corners(self) -> Float[Tensor, "m k D"]:
         """Float64 positions of the corners of each cell."""
         return self.vertices.double()[self.faces]
 
-    @cached_property
+    @constant_property
     def _double_measures(self) -> Float[Tensor, "m"]:
         """Float64 measures, for operators assembled in double whatever the mesh's dtype."""
         return cells.measures(self._corners)
 
-    @cached_property
+    @constant_property
     def _double_frames(self) -> Float[Tensor, "m D d"]:
         """Float64 frames (see `frames`)."""
         return cells.frames(self._corners)
 
-    @cached_property
+    @constant_property
     def measures(self) -> Float[Tensor, "m"]:
         """Area of each triangle in units², or volume of each tetrahedron in units³; positive."""
         return self._double_measures.to(self.dtype)
@@ -199,13 +204,13 @@ class Mesh:
             raise MeshError("volumes need tetrahedra: faces are (m, 3), not (m, 4)")
         return self.measures
 
-    @cached_property
+    @constant_property
     def normals(self) -> Float[Tensor, "m 3"]:
         """Unit normal of each triangle; only in space."""
         vectors = self._area_vectors("normals")
         return (vectors / torch.linalg.vector_norm(vectors, dim=1, keepdim=True)).to(self.dtype)
 
-    @cached_property
+    @constant_property
     def frames(self) -> Float[Tensor, "m D d"]:
         """Orthonormal, oriented basis B of each tangent plane as columns: B₁ × B₂ = normal.
 
@@ -214,17 +219,17 @@ class Mesh:
         """
         return self._double_frames.to(self.dtype)
 
-    @cached_property
+    @constant_property
     def centroids(self) -> Float[Tensor, "m D"]:
         """Barycentre of each cell."""
         return self.vertices[self.faces].mean(dim=1)
 
-    @cached_property
+    @constant_property
     def _double_vertex_measures(self) -> Float[Tensor, "n"]:
         """Float64 vertex measures (see `vertex_measures`)."""
         return self.sum_at_vertices(self._double_measures[:, None] / self.faces.shape[1])[:, 0]
 
-    @cached_property
+    @constant_property
     def vertex_measures(self) -> Float[Tensor, "n"]:
         """Lumped mass: an equal share of the measure of each cell around a vertex."""
         return self._double_vertex_measures.to(self.dtype)
@@ -235,7 +240,7 @@ class Mesh:
         self._require_triangles("vertex_areas")
         return self.vertex_measures
 
-    @cached_property
+    @constant_property
     def vertex_normals(self) -> Float[Tensor, "n 3"]:
         """Unit vertex normals, the faces' weighted by area; zero where those cancel."""
         total = self.sum_at_vertices(self._area_vectors("vertex_normals"))
@@ -261,7 +266,7 @@ class Mesh:
 
     # ---------------------------------------------------------------- topology
 
-    @cached_property
+    @constant_property
     def components(self) -> Int[Tensor, "n"]:
         """Label in 0 … n_components - 1 of the connected component of each vertex."""
         labels = topology.component_labels(self._numpy_faces, self.n_vertices)
@@ -272,20 +277,20 @@ class Mesh:
         """Number of connected components; cells that share a vertex are connected."""
         return int(self.components.max()) + 1
 
-    @cached_property
+    @constant_property
     def euler_characteristic(self) -> int:
         """V - E + F of a triangle mesh."""
         self._require_triangles("euler_characteristic")
         n_edges = len(topology.undirected_edges(self._numpy_faces)[0])
         return self.n_vertices - n_edges + self.n_faces
 
-    @cached_property
+    @constant_property
     def is_manifold(self) -> bool:
         """Whether edges have at most two, consistently oriented faces and vertices one fan."""
         self._require_triangles("is_manifold")
         return topology.is_manifold(self._numpy_faces, self.n_vertices)
 
-    @cached_property
+    @constant_property
     def boundary_loops(self) -> list[Tensor]:
         """Each boundary as its cycle of vertices, along the faces' edges, longest first.
 
@@ -311,7 +316,7 @@ class Mesh:
             )
         return [torch.from_numpy(loop).to(self.device) for loop in topology.cycles(tails, heads)]
 
-    @cached_property
+    @constant_property
     def is_disk(self) -> bool:
         """Whether the mesh is a disk: connected, manifold, χ = 1 (hence one boundary)."""
         return self.n_components == 1 and self.is_manifold and self.euler_characteristic == 1
@@ -329,10 +334,9 @@ class Mesh:
         Parts keep their order: `split_vertices` and `split_faces` take per-vertex and per-face
         values of the union apart again.
         """
-        if len(meshes) == 0:
+        require_instances("Mesh.concatenate", meshes, Mesh)
+        if not meshes:
             raise MeshError("Mesh.concatenate: needs at least one mesh")
-        for mesh in meshes:
-            require_mesh("Mesh.concatenate", mesh)
         kinds = sorted({f"D={m.dim} d={m.cell_dim} {m.dtype} {m.device}" for m in meshes})
         if len(kinds) > 1:
             raise MeshError(
@@ -353,12 +357,12 @@ class Mesh:
         """Number of meshes that were concatenated; 1 for a mesh built from arrays."""
         return len(self.face_offsets) - 1
 
-    @cached_property
+    @constant_property
     def part_of_vertex(self) -> Int[Tensor, "n"]:
         """The part each vertex belongs to."""
         return _owners(self.vertex_offsets, self.device)
 
-    @cached_property
+    @constant_property
     def part_of_face(self) -> Int[Tensor, "m"]:
         """The part each face belongs to."""
         return _owners(self.face_offsets, self.device)
@@ -391,6 +395,7 @@ class Mesh:
         Raises:
             MeshError: wrong shape or dtype, or no face is left.
         """
+        _require_constant(vertices)
         vertices, faces = _as_tensors(vertices, faces)
         _check_arrays(vertices, faces)
         merged = torch.arange(len(vertices), device=vertices.device)
@@ -423,9 +428,23 @@ def require_mesh(operation: str, mesh: object) -> None:
         )
 
 
+def require_cells(operation: str, vertices: Tensor | None, faces: Tensor) -> None:
+    """Raise MeshError where positions, if known, leave cells without area or volume."""
+    if vertices is None:
+        return
+    corners = vertices.double()[faces]
+    flat = cells.degenerate(corners) | ~corners.flatten(1).isfinite().all(dim=1)
+    if flat.any():
+        culprits = describe_indices(flat.nonzero()[:, 0], "face", "faces")
+        raise MeshError(
+            f"{operation}: at the given vertices, {culprits} not finite or of zero "
+            f"{_measure(faces)}"
+        )
+
+
 def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     try:
-        vertices, faces = _as_tensor(vertices), _as_tensor(faces)
+        vertices, faces = as_tensor(vertices), as_tensor(faces)
     except (TypeError, ValueError, RuntimeError) as error:
         raise MeshError(
             f"Mesh: vertices and faces must be tensors or numeric arrays: {error}"
@@ -437,13 +456,26 @@ def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     return vertices, faces.long() if _is_integer(faces) else faces
 
 
-def _as_tensor(values: ArrayLike) -> Tensor:
-    # torch cannot share arrays that are read-only or have negative strides, such as faces[:, ::-1].
-    return torch.as_tensor(values.copy() if isinstance(values, np.ndarray) else values)
+def _as_device(target: object) -> torch.device:
+    if not isinstance(target, (str, torch.device)):
+        raise TypeError(f"Mesh.to: expected a dtype or a device, got {type(target).__name__}")
+    try:
+        return torch.device(target)
+    except RuntimeError as error:
+        raise ValueError(f"Mesh.to: {target!r} is no device: {error}") from error
 
 
 def _is_integer(values: Tensor) -> bool:
     return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+
+
+def _require_constant(vertices: ArrayLike) -> None:
+    if isinstance(vertices, Tensor) and (vertices.requires_grad or is_transformed(vertices)):
+        raise MeshError(
+            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
+            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
+            "the solver"
+        )
 
 
 def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
@@ -459,12 +491,6 @@ def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
     if vertices.dtype not in (torch.float32, torch.float64):
         raise MeshError(
             f"Mesh: vertices must be float32 or float64, got {vertices.dtype}; convert them"
-        )
-    if vertices.requires_grad:
-        raise MeshError(
-            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
-            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
-            "the solver"
         )
     if faces.ndim != 2 or faces.shape[1] not in (3, 4):
         raise MeshError(
@@ -542,10 +568,13 @@ def _repeated(faces: Int[Tensor, "m k"]) -> Bool[Tensor, "m"]:
 
 
 def _split(
-    operation: str, values: Tensor, offsets: tuple[int, ...], dim: int
+    operation: str, values: object, offsets: tuple[int, ...], dim: int
 ) -> tuple[Tensor, ...]:
-    if not isinstance(values, Tensor):
-        raise TypeError(f"{operation}: values must be a torch tensor, got {type(values).__name__}")
+    if not isinstance(values, Tensor) or values.layout != torch.strided:
+        raise TypeError(
+            f"{operation}: values must be a dense torch tensor, got {type(values).__name__}"
+        )
+    require_integer(operation, "dim", dim)
     if not -values.ndim <= dim < values.ndim or values.shape[dim] != offsets[-1]:
         raise ValueError(
             f"{operation}: expected {offsets[-1]} values along dim {dim}, got {tuple(values.shape)}"

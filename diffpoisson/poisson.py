@@ -28,7 +28,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from diffpoisson.arguments import require_count, require_tensor
+from diffpoisson import cells
+from diffpoisson.arguments import require_instances, require_integer, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -40,8 +41,9 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix, require_equal
-from diffpoisson.mesh import Mesh, require_mesh
+from diffpoisson.linear_map import LinearMap, Matrix
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
+from diffpoisson.transforms import outside_transforms, require_equal
 
 
 class PoissonSolver:
@@ -67,6 +69,7 @@ class PoissonSolver:
         ValueError: indices out of range, named twice, or both pinned and handles; every vertex
             pinned; weights that are negative or not finite; a vertex that only faces of weight zero
             touch; a gauge mask that misses a component.
+        MeshError: faces so thin that rounding makes the Laplacian indefinite.
     """
 
     def __init__(
@@ -80,18 +83,19 @@ class PoissonSolver:
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
         require_mesh("PoissonSolver", mesh)
-        self._options: dict[str, Any] = {
-            "gauge": gauge,
-            "pins": pins,
-            "handles": handles,
-            "handle_weights": handle_weights,
-            "face_weights": face_weights,
-        }
-        constraints = Constraints.build(mesh, **self._options)
-        free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
-        divergence, L = _assemble(mesh, constraints)
-        factor = CholeskyFactor(L[free][:, free], mesh.device)
-        self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+        with outside_transforms():
+            constraints = Constraints.build(
+                mesh,
+                gauge=gauge,
+                pins=pins,
+                handles=handles,
+                handle_weights=handle_weights,
+                face_weights=face_weights,
+            )
+            free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
+            divergence, L = _assemble(mesh, constraints)
+            factor = _factorised(L[free][:, free], mesh)
+            self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
         self,
@@ -127,7 +131,15 @@ class PoissonSolver:
         Args:
             vertices: (n, D) new positions.
         """
-        return PoissonSolver(self.mesh.with_vertices(vertices), **self._options)
+        constraints = self.constraints
+        return PoissonSolver(
+            self.mesh.with_vertices(vertices),
+            gauge="vertex" if constraints.gauge_mask is None else constraints.gauge_mask,
+            pins=constraints.pins,
+            handles=constraints.handles,
+            handle_weights=constraints.handle_weights,
+            face_weights=constraints.face_weights,
+        )
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:
@@ -139,10 +151,10 @@ class PoissonSolver:
             ValueError: some solvers have the gauge "vertex" and others do not.
             MeshError: the meshes differ in dimension, dtype or device.
         """
+        require_instances("PoissonSolver.concatenate", solvers, PoissonSolver)
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
-        union._options = {}
         union._assign(
             mesh,
             Constraints.concatenate([solver.constraints for solver in solvers]),
@@ -186,6 +198,7 @@ class PoissonSolver:
         Raises:
             ValueError: shapes that do not fit; images missing for pins or handles, or given
                 without; `vertices` or `face_weights` that differ from those that were factorised.
+            TypeError: what should be a tensor is none, or not of floating dtype.
         """
         require_tensor("PoissonSolver", "R", R, self.mesh.device)
         geometry = self._moving_geometry(vertices, face_weights, order)
@@ -197,10 +210,14 @@ class PoissonSolver:
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        pull = constraints.handle_weights[:, None] * q_handles
-
-        b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
-        phi = self._scattered(self._inverse(b.index_add(0, self._handle_rows, pull)), q_pins)
+        b = self._divergence(matrices_to_columns(intrinsic))
+        if q_pins is not None:
+            b = b - self._coupling(q_pins)
+        pull = None
+        if q_handles is not None:
+            pull = constraints.handle_weights[:, None] * q_handles
+            b = b.index_add(0, self._handle_rows, pull)
+        phi = self._scattered(self._inverse(b), q_pins)
         means = self._mean_weights
         if geometry is not None:
             for _ in range(order):
@@ -223,20 +240,22 @@ class PoissonSolver:
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
                 f"got {tuple(b.shape)}"
             )
-        x = self._inverse(b[self.constraints.free].double())
-        return self._scattered(x, x.new_zeros(len(self.constraints.pins), b.shape[1])).to(b.dtype)
+        return self._scattered(self._inverse(b[self.constraints.free].double())).to(b.dtype)
 
     # ---------------------------------------------------------------- steps of a solve
 
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
-    ) -> Float[Tensor, "count k"]:
-        """Given images as columns; none for no constraints."""
+    ) -> Float[Tensor, "count k"] | None:
+        """Given images as columns; None if there are none to give."""
         if (values is None) != (count == 0):
             verb = "missing" if values is None else "given"
             raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
-        if values is None:
-            return self._frames.new_zeros(0, batch.numel() * c)
+        return None if values is None else self._columns(name, values, count, batch, c)
+
+    def _columns(
+        self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
+    ) -> Float[Tensor, "count k"]:
         require_tensor("PoissonSolver", name, values, self.mesh.device)
         if values.shape[-2:] != (count, c) or not _expands(values.shape[:-2], batch):
             raise ValueError(
@@ -259,11 +278,13 @@ class PoissonSolver:
             )
         return transforms.double() @ R
 
-    def _scattered(self, x: Tensor, q_pins: Tensor) -> Float[Tensor, "n k"]:
-        """Values at the free vertices and pins, zero at the anchors."""
+    def _scattered(
+        self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None
+    ) -> Float[Tensor, "n k"]:
+        """Values at the free vertices and, if given, at the pins; zero elsewhere."""
         phi = x.new_zeros(self.mesh.n_vertices, x.shape[1])
         phi = phi.index_copy(0, self.constraints.free, x)
-        return phi.index_copy(0, self.constraints.pins, q_pins)
+        return phi if q_pins is None else phi.index_copy(0, self.constraints.pins, q_pins)
 
     def _placed(
         self,
@@ -280,9 +301,8 @@ class PoissonSolver:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
         shifts = shifts[:-1]
         if translations is not None:
-            q = self._given("floating components", translations, self.n_floating, batch, c)
-            shifts = shifts + q
-        # What is held does not move, nor catches a NaN (weighed by zero) from other components.
+            shifts = shifts + self._columns("translations", translations, self.n_floating, batch, c)
+        # What is held stays where it is, and catches no NaN, times zero, from other components.
         shifts = torch.cat([shifts, shifts.new_zeros(1, shifts.shape[1])])
         return phi + shifts.index_select(0, constraints.floating)
 
@@ -294,7 +314,7 @@ class PoissonSolver:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        require_count("PoissonSolver", "order", order)
+        require_integer("PoissonSolver", "order", order, least=0)
         own = (self.mesh.vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
@@ -314,15 +334,17 @@ class PoissonSolver:
         face_weights: Tensor | None,
         phi: Float[Tensor, "n k"],
         R: Float[Tensor, "*batch m c d"],
-        pull: Float[Tensor, "h k"],
+        pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "f k"]:
         """b(v) - (L(v) + W) Φ at the free vertices."""
         constraints = self.constraints
         weights = constraints.face_weights if face_weights is None else face_weights.double()
         misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
         fit = vertices_to_columns(geometry.divergence(misfit, weights))
-        held = constraints.handle_weights[:, None] * phi[constraints.handles]
-        return fit.index_add(0, constraints.handles, pull - held)[constraints.free]
+        if pull is not None:
+            held = constraints.handle_weights[:, None] * phi[constraints.handles]
+            fit = fit.index_add(0, constraints.handles, pull - held)
+        return fit[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints
@@ -351,6 +373,20 @@ def _expands(shape: torch.Size, batch: torch.Size) -> bool:
     """Whether dimensions broadcast to given ones, without changing those."""
     pairs = zip(reversed(shape), reversed(batch), strict=False)
     return len(shape) <= len(batch) and all(size in (1, total) for size, total in pairs)
+
+
+def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
+    """The factor of what is positive definite but for rounding."""
+    try:
+        return CholeskyFactor(L, mesh.device)
+    except ValueError as error:
+        thinness = cells.thinness(mesh._corners)
+        worst = int(thinness.argmin())
+        raise MeshError(
+            "PoissonSolver: in float64 the Laplacian of this mesh is not positive definite; its "
+            f"thinnest face, {worst}, has a height of {float(thinness[worst]):.0e} of its longest "
+            f"edge: remesh such faces, or bring weights closer together ({error})"
+        ) from error
 
 
 def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.csr_matrix]:

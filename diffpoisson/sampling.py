@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffpoisson.arguments import require_count, require_tensor
+from diffpoisson.arguments import require_integer, require_tensor
 from diffpoisson.mesh import Mesh, require_mesh
 
 
@@ -52,7 +52,7 @@ def sample_surface(
         ValueError: n_samples is negative.
     """
     require_mesh("sample_surface", mesh)
-    require_count("sample_surface", "n_samples", n_samples)
+    require_integer("sample_surface", "n_samples", n_samples, least=0)
 
     def uniform() -> Tensor:
         like = mesh.areas.new_empty(n_samples, dtype=torch.float64)

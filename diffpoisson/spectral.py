@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from diffpoisson.arguments import require_count, to_tensor
+from diffpoisson.arguments import require_integer, to_tensor
 from diffpoisson.gradient import laplacian
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.poisson import PoissonSolver
@@ -53,7 +53,7 @@ def laplacian_eigenpairs(
         ValueError: the solver is another mesh's.
     """
     require_mesh("laplacian_eigenpairs", mesh)
-    require_count("laplacian_eigenpairs", "n_eigenpairs", n_eigenpairs)
+    require_integer("laplacian_eigenpairs", "n_eigenpairs", n_eigenpairs)
     n, zeros = mesh.n_vertices, mesh.n_components
     if not 1 <= n_eigenpairs <= n:
         raise MeshError(
@@ -62,6 +62,9 @@ def laplacian_eigenpairs(
     if solver is not None and solver.mesh is not mesh:
         raise ValueError("laplacian_eigenpairs: the solver belongs to another mesh; pass its own")
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
+    # Of total one, so that no scale is too large or small for ARPACK's tolerances.
+    total = areas.sum()
+    areas = areas / total
     wanted = n_eigenpairs - zeros
     # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.
     if wanted > 0 and 2 * wanted + 1 < n - zeros:
@@ -73,6 +76,7 @@ def laplacian_eigenpairs(
         pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
     values = np.concatenate([np.zeros(zeros), pairs[0]])[:n_eigenpairs]
     vectors = np.concatenate([_constants(mesh, areas), pairs[1]], axis=1)[:, :n_eigenpairs]
+    values, vectors = values / total, vectors / np.sqrt(total)
     return torch.from_numpy(values).to(mesh.vertices), torch.from_numpy(vectors).to(mesh.vertices)
 
 
@@ -120,7 +124,7 @@ def wave_kernel_signature(
     Raises:
         MeshError: too few vertices, or no two different non-zero eigenvalues, for this spectrum.
     """
-    require_count("wave_kernel_signature", "n_energies", n_energies, least=1)
+    require_integer("wave_kernel_signature", "n_energies", n_energies, least=1)
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
     log_values = values[mesh.n_components :].double().log()
     if len(log_values) < 2 or log_values[0] == log_values[-1]:
@@ -161,10 +165,10 @@ def heat_kernel_signature(
         ValueError: negative times.
     """
     require_mesh("heat_kernel_signature", mesh)
-    times = to_tensor("heat_kernel_signature", "times", times, mesh.device)
-    if times.ndim != 1 or not (times >= 0).all():
+    times = to_tensor("heat_kernel_signature", "times", times, mesh.device).to(mesh.dtype)
+    if times.ndim != 1 or not ((times >= 0) & times.isfinite()).all():
         raise ValueError(
-            "heat_kernel_signature: times must be (t,) and not negative, got shape "
+            "heat_kernel_signature: times must be (t,), finite and not negative, got shape "
             f"{tuple(times.shape)}"
         )
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)

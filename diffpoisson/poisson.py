@@ -8,13 +8,9 @@ with neither pin nor handle is determined up to a translation, so one vertex of 
 eliminated too, and the gauge fixes the translation. What remains is positive definite, and
 factorised once.
 
-Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For
-positions v with the same values that require grad, k steps of refinement
-
-    Φ ← Φ + F⁻¹ (b(v) - L(v) Φ)
-
-change no value, but make the result's derivatives by v exact up to order k: each step turns an
-error of order j in a perturbation of v into one of order j + 1.
+Derivatives by the geometry. Positions or face weights that require grad may be given again to a
+solve. Value and factor stay the same, and the solve is differentiated as a function of L and the
+right-hand side: each derivative is one more solve with the factor, exact to any order.
 """
 
 from __future__ import annotations
@@ -39,7 +35,7 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix, require_equal
+from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix, require_equal
 from diffpoisson.mesh import Mesh
 
 
@@ -108,6 +104,8 @@ class PoissonSolver:
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
+        rows = torch.where(free_index < 0, len(constraints.free), free_index)
+        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
         self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
@@ -160,7 +158,6 @@ class PoissonSolver:
         transforms: Float[Tensor, "*#batch m c c"] | None = None,
         vertices: Float[Tensor, "n D"] | None = None,
         face_weights: Float[Tensor, "m"] | None = None,
-        order: int = 1,
     ) -> Float[Tensor, "*batch n c"]:
         """The map whose Jacobians are closest to R in the area-weighted least-squares sense.
 
@@ -175,8 +172,6 @@ class PoissonSolver:
             vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
             face_weights: (m,) the solver's own face weights again, if derivatives by them are
                 wanted.
-            order: up to which order derivatives by `vertices` and `face_weights` are exact; each
-                order costs one more solve. Higher derivatives are wrong, so do not take them.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
@@ -185,7 +180,7 @@ class PoissonSolver:
             ValueError: shapes that do not fit; images missing for pins or handles, or given
                 without; `vertices` or `face_weights` that differ from those that were factorised.
         """
-        geometry = self._moving_geometry(vertices, face_weights, order)
+        geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
         if transforms is not None:
@@ -196,14 +191,16 @@ class PoissonSolver:
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
         pull = constraints.handle_weights[:, None] * q_handles
 
-        b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
-        phi = self._scattered(self._inverse(b.index_add(0, self._handle_rows, pull)), q_pins)
-        means = self._mean_weights
-        if geometry is not None:
-            for _ in range(order):
-                residual = self._residual(geometry, face_weights, phi, intrinsic, pull)
-                phi = phi.index_add(0, constraints.free, self._inverse(residual))
+        if geometry is None:
+            b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
+            x = self._inverse(b.index_add(0, self._handle_rows, pull))
+            means = self._mean_weights
+        else:
+            weights = constraints.face_weights if face_weights is None else face_weights.double()
+            b = self._right_hand_side(geometry, weights, intrinsic, q_pins, pull)
+            x = self._moving_inverse(geometry.stiffness(weights), b)
             means = constraints.mean_weights(geometry.vertex_measures())
+        phi = self._scattered(x, q_pins)
         phi = self._placed(phi, means, translations, batch, c)
         return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
@@ -267,40 +264,37 @@ class PoissonSolver:
     # ---------------------------------------------------------------- derivatives by the geometry
 
     def _moving_geometry(
-        self, vertices: Tensor | None, face_weights: Tensor | None, order: int
+        self, vertices: Tensor | None, face_weights: Tensor | None
     ) -> CellGeometry | None:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        if order < 0:
-            raise ValueError(f"PoissonSolver: order must not be negative, got {order}")
         own = (self.mesh.vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
                 require_equal(
-                    yours.to(mine.dtype),
-                    mine,
+                    yours.double(),
+                    mine.double(),
                     f"PoissonSolver: {name} differ from those that were factorised; solve with "
                     "solver.update(vertices), or with a solver of these weights",
                 )
         return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
 
-    def _residual(
+    def _right_hand_side(
         self,
         geometry: CellGeometry,
-        face_weights: Tensor | None,
-        phi: Float[Tensor, "n k"],
+        weights: Float[Tensor, "m"],
         R: Float[Tensor, "*batch m c d"],
+        q_pins: Float[Tensor, "p k"],
         pull: Float[Tensor, "h k"],
     ) -> Float[Tensor, "f k"]:
-        """b(v) - (L(v) + W) Φ at the free vertices."""
+        """∇ᵀA (R - ∇Φ) + W q at the free vertices, where Φ is zero but at the pins."""
         constraints = self.constraints
-        weights = constraints.face_weights if face_weights is None else face_weights.double()
-        misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
-        fit = vertices_to_columns(geometry.divergence(misfit, weights))
-        held = constraints.handle_weights[:, None] * phi[constraints.handles]
-        return fit.index_add(0, constraints.handles, pull - held)[constraints.free]
+        held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
+        held = columns_to_vertices(held.index_copy(0, constraints.pins, q_pins), R.shape)
+        fit = vertices_to_columns(geometry.divergence(R - geometry.gradient(held), weights))
+        return fit.index_add(0, constraints.handles, pull)[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints

@@ -100,24 +100,6 @@ class CellwiseInverse:
         return _solve(self._handle, self._cells, K, b)
 
 
-def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
-    """Raise unless a tensor, under whatever transforms, has the expected values.
-
-    Raises:
-        ValueError: other values, or a batch of them under vmap. Compiled, where values are not
-            known while tracing, a RuntimeError with the same message when it runs.
-    """
-    if torch.compiler.is_compiling():
-        torch._assert_async((value.detach() == expected).all(), message)
-        return
-    while torch._C._functorch.is_functorch_wrapped_tensor(value):
-        if torch._C._functorch.is_batchedtensor(value):
-            raise ValueError(f"{message} (vmap gives one for each element of the batch)")
-        value = torch._C._functorch.get_unwrapped(value)
-    if not torch.equal(value.detach(), expected):
-        raise ValueError(message)
-
-
 # ------------------------------------------------------- y = A x
 
 
@@ -253,6 +235,7 @@ def _register(
     name: str,
     arguments: str,
     function: type[torch.autograd.Function],
+    *,
     kernel: Callable[..., Tensor],
     fake: Callable[..., Tensor],
     batched: Callable[..., tuple[Tensor, int]],
@@ -280,15 +263,15 @@ _apply = _register(
     "linear_map",
     f"{_handle} A, {_handle} A_transposed, Tensor x, int rows, int cols",
     _Apply,
-    _kernel,
-    _fake,
-    _vmap,
+    kernel=_kernel,
+    fake=_fake,
+    batched=_vmap,
 )
 _solve = _register(
     "solve",
     f"{_handle} A_inverse, Tensor cells, Tensor K, Tensor b",
     _Solve,
-    _solve_kernel,
-    _solve_fake,
-    _solve_vmap,
+    kernel=_solve_kernel,
+    fake=_solve_fake,
+    batched=_solve_vmap,
 )

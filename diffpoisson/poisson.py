@@ -35,8 +35,9 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix, require_equal
+from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix
 from diffpoisson.mesh import Mesh
+from diffpoisson.transforms import outside_transforms, require_equal
 
 
 class PoissonSolver:
@@ -74,18 +75,19 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
-        self._options: dict[str, Any] = {
-            "gauge": gauge,
-            "pins": pins,
-            "handles": handles,
-            "handle_weights": handle_weights,
-            "face_weights": face_weights,
-        }
-        constraints = Constraints.build(mesh, **self._options)
-        free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
-        divergence, L = _assemble(mesh, constraints)
-        factor = CholeskyFactor(L[free][:, free], mesh.device)
-        self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+        with outside_transforms():
+            constraints = Constraints.build(
+                mesh,
+                gauge=gauge,
+                pins=pins,
+                handles=handles,
+                handle_weights=handle_weights,
+                face_weights=face_weights,
+            )
+            free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
+            divergence, L = _assemble(mesh, constraints)
+            factor = CholeskyFactor(L[free][:, free], mesh.device)
+            self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
         self,
@@ -123,7 +125,15 @@ class PoissonSolver:
         Args:
             vertices: (n, D) new positions.
         """
-        return PoissonSolver(self.mesh.with_vertices(vertices), **self._options)
+        constraints = self.constraints
+        return PoissonSolver(
+            self.mesh.with_vertices(vertices),
+            gauge="vertex" if constraints.gauge_mask is None else constraints.gauge_mask,
+            pins=constraints.pins,
+            handles=constraints.handles,
+            handle_weights=constraints.handle_weights,
+            face_weights=constraints.face_weights,
+        )
 
     @classmethod
     def concatenate(cls, solvers: Sequence[PoissonSolver]) -> PoissonSolver:
@@ -138,7 +148,6 @@ class PoissonSolver:
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
-        union._options = {}
         union._assign(
             mesh,
             Constraints.concatenate([solver.constraints for solver in solvers]),
@@ -189,11 +198,17 @@ class PoissonSolver:
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        pull = constraints.handle_weights[:, None] * q_handles
+        pull = None
+        if q_handles is not None:
+            pull = constraints.handle_weights[:, None] * q_handles
 
         if geometry is None:
-            b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
-            x = self._inverse(b.index_add(0, self._handle_rows, pull))
+            b = self._divergence(matrices_to_columns(intrinsic))
+            if q_pins is not None:
+                b = b - self._coupling(q_pins)
+            if pull is not None:
+                b = b.index_add(0, self._handle_rows, pull)
+            x = self._inverse(b)
             means = self._mean_weights
         else:
             weights = constraints.face_weights if face_weights is None else face_weights.double()
@@ -216,20 +231,22 @@ class PoissonSolver:
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
                 f"got {tuple(b.shape)}"
             )
-        x = self._inverse(b[self.constraints.free].double())
-        return self._scattered(x, x.new_zeros(len(self.constraints.pins), b.shape[1])).to(b.dtype)
+        return self._scattered(self._inverse(b[self.constraints.free].double())).to(b.dtype)
 
     # ---------------------------------------------------------------- steps of a solve
 
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
-    ) -> Float[Tensor, "count k"]:
-        """Given images as columns; none for no constraints."""
+    ) -> Float[Tensor, "count k"] | None:
+        """Given images as columns; None if there are none to give."""
         if (values is None) != (count == 0):
             verb = "missing" if values is None else "given"
             raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
-        if values is None:
-            return self._frames.new_zeros(0, batch.numel() * c)
+        return None if values is None else self._columns(name, values, count, batch, c)
+
+    def _columns(
+        self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
+    ) -> Float[Tensor, "count k"]:
         if values.shape[-2:] != (count, c):
             raise ValueError(
                 f"PoissonSolver: expected {name} of shape (…, {count}, {c}), "
@@ -237,11 +254,13 @@ class PoissonSolver:
             )
         return vertices_to_columns(values.double().expand(*batch, count, c))
 
-    def _scattered(self, x: Tensor, q_pins: Tensor) -> Float[Tensor, "n k"]:
-        """Values at the free vertices and pins, zero at the anchors."""
+    def _scattered(
+        self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None
+    ) -> Float[Tensor, "n k"]:
+        """Values at the free vertices and, if given, at the pins; zero elsewhere."""
         phi = x.new_zeros(self.mesh.n_vertices, x.shape[1])
         phi = phi.index_copy(0, self.constraints.free, x)
-        return phi.index_copy(0, self.constraints.pins, q_pins)
+        return phi if q_pins is None else phi.index_copy(0, self.constraints.pins, q_pins)
 
     def _placed(
         self,
@@ -257,8 +276,8 @@ class PoissonSolver:
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
         if translations is not None:
-            q = self._given("floating components", translations, self.n_floating, batch, c)
-            shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
+            q = self._columns("translations", translations, self.n_floating, batch, c)
+            shifts = torch.cat([shifts[:-1] + q, shifts[-1:]])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
@@ -286,15 +305,19 @@ class PoissonSolver:
         geometry: CellGeometry,
         weights: Float[Tensor, "m"],
         R: Float[Tensor, "*batch m c d"],
-        q_pins: Float[Tensor, "p k"],
-        pull: Float[Tensor, "h k"],
+        q_pins: Float[Tensor, "p k"] | None,
+        pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "f k"]:
         """∇ᵀA (R - ∇Φ) + W q at the free vertices, where Φ is zero but at the pins."""
         constraints = self.constraints
-        held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
-        held = columns_to_vertices(held.index_copy(0, constraints.pins, q_pins), R.shape)
-        fit = vertices_to_columns(geometry.divergence(R - geometry.gradient(held), weights))
-        return fit.index_add(0, constraints.handles, pull)[constraints.free]
+        if q_pins is not None:
+            held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
+            held = held.index_copy(0, constraints.pins, q_pins)
+            R = R - geometry.gradient(columns_to_vertices(held, R.shape))
+        b = vertices_to_columns(geometry.divergence(R, weights))
+        if pull is not None:
+            b = b.index_add(0, constraints.handles, pull)
+        return b[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given
-from torch.func import grad, hessian, jacfwd, jacrev, vmap
+from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
 import diffpoisson as dp
 from tests import checks, meshes, references
@@ -216,3 +216,61 @@ def test_repr():
     solver = dp.PoissonSolver(dp.Mesh(*meshes.triangle()), gauge="vertex")
     assert repr(solver).startswith("PoissonSolver(Mesh(n_vertices=3")
     assert repr(solver).endswith("0 pins, 0 handles, 1 floating components)")
+
+
+def test_updating_a_union_keeps_its_constraints():
+    """The union of a pinned and a free solver, moved, is the union of both moved."""
+    pinned = dp.PoissonSolver(dp.Mesh(*meshes.disk()), pins=torch.tensor([3, 0]))
+    free = dp.PoissonSolver(dp.Mesh(*meshes.sphere()))
+    moved = [2 * solver.mesh.vertices.sin() + solver.mesh.vertices for solver in (pinned, free)]
+    union = dp.PoissonSolver.concatenate([pinned, free]).update(torch.cat(moved))
+    R, images = field(union.mesh), torch.from_numpy(np.random.default_rng(1).random((2, 3)))
+    expected = [
+        pinned.update(moved[0])(R[: pinned.mesh.n_faces], pins=images),
+        free.update(moved[1])(R[pinned.mesh.n_faces :]),
+    ]
+    assert_near(union(R, pins=images), torch.cat(expected), SOLVE)
+
+
+@pytest.mark.parametrize("transform", ["grad", "jvp", "hessian", "vmap", "inference"])
+def test_first_use_inside_a_transform_leaves_no_trace(transform):
+    """Mesh, operators and factor made inside: the same numbers, and usable afterwards."""
+    vertices, faces = meshes.disk()
+    expected = dp.PoissonSolver(dp.Mesh(vertices, faces))
+    R = field(expected.mesh, c=2)
+    kept = []
+
+    def energy(R):
+        mesh = dp.Mesh(vertices, faces)
+        solver = dp.PoissonSolver(mesh)
+        kept.append((mesh, solver))
+        return dp.jacobians(mesh, solver(R), extrinsic=True).sin().sum() + mesh.normals.sum()
+
+    def known(R):
+        J = dp.jacobians(expected.mesh, expected(R), extrinsic=True)
+        return J.sin().sum() + expected.mesh.normals.sum()
+
+    def apply(function):
+        if transform == "grad":
+            return grad(function)(R)
+        if transform == "jvp":
+            return jvp(function, (R,), (R.cos(),))[1]
+        if transform == "hessian":
+            return hessian(lambda t: function(t * R))(torch.ones(2, 1, dtype=R.dtype))
+        if transform == "vmap":
+            return vmap(function)(torch.stack([R, 2 * R]))
+        with torch.inference_mode():
+            return function(R)
+
+    assert_near(apply(energy), apply(known), SOLVE)
+    mesh, solver = kept[0]
+    R = R.clone().requires_grad_()
+    (dp.jacobians(mesh, solver(R)) * mesh.frames[:, :2]).sum().backward()
+    assert R.grad.isfinite().all()
+
+
+def test_a_mesh_of_differentiated_vertices_raises():
+    vertices, faces = meshes.disk()
+    R = field(dp.Mesh(vertices, faces), c=2)
+    with pytest.raises(dp.MeshError, match="vertices require grad"):
+        grad(lambda v: dp.solve_poisson(dp.Mesh(v, faces), R).sum())(torch.from_numpy(vertices))

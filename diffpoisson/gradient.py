@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from functools import cached_property
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -23,6 +22,7 @@ from diffpoisson import cells
 from diffpoisson.linear_map import LinearMap, Matrix
 from diffpoisson.mesh import Mesh
 from diffpoisson.restriction import extend, restrict
+from diffpoisson.transforms import constant_property, outside_transforms
 
 
 class SparseMatrix(Matrix):
@@ -88,13 +88,13 @@ class GradientOperator:
         self.adjoint = self.gradient.T
         self.weights = mesh._double_measures.repeat_interleave(mesh.cell_dim)[:, None]
 
-    @cached_property
+    @constant_property
     def divergence_matrix(self) -> sp.csr_matrix:
         """∇ᵀA as a SciPy matrix (n, m·d)."""
         weights = self.weights[:, 0].cpu().numpy()
         return (sp.diags(weights) @ self.matrix).T.tocsr()
 
-    @cached_property
+    @constant_property
     def laplacian(self) -> sp.csr_matrix:
         """L = ∇ᵀA∇ as a SciPy matrix (n, n)."""
         return (self.divergence_matrix @ self.matrix).tocsr()
@@ -106,7 +106,8 @@ _operators: WeakKeyDictionary[Mesh, GradientOperator] = WeakKeyDictionary()
 def gradient_operator(mesh: Mesh) -> GradientOperator:
     """The mesh's operators, assembled at the first call and kept as long as the mesh lives."""
     if mesh not in _operators:
-        _operators[mesh] = GradientOperator(mesh)
+        with outside_transforms():
+            _operators[mesh] = GradientOperator(mesh)
     return _operators[mesh]
 
 

@@ -74,24 +74,6 @@ class LinearMap:
         return adjoint
 
 
-def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
-    """Raise unless a tensor, under whatever transforms, has the expected values.
-
-    Raises:
-        ValueError: other values, or a batch of them under vmap. Compiled, where values are not
-            known while tracing, a RuntimeError with the same message when it runs.
-    """
-    if torch.compiler.is_compiling():
-        torch._assert_async((value.detach() == expected).all(), message)
-        return
-    while torch._C._functorch.is_functorch_wrapped_tensor(value):
-        if torch._C._functorch.is_batchedtensor(value):
-            raise ValueError(f"{message} (vmap gives one for each element of the batch)")
-        value = torch._C._functorch.get_unwrapped(value)
-    if not torch.equal(value.detach(), expected):
-        raise ValueError(message)
-
-
 register_opaque_type(_Handle, typ="reference")
 _library = torch.library.Library("diffpoisson", "DEF")
 _handle = get_opaque_type_name(_Handle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells, topology
+from diffpoisson.transforms import constant_property, is_transformed, outside_transforms
 
 ArrayLike = Tensor | np.ndarray
 
@@ -71,10 +71,12 @@ class Mesh:
     face_offsets: tuple[int, ...]
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        vertices, faces = _as_tensors(vertices, faces)
-        _validate(vertices, faces)
-        # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
-        self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
+        _require_constant(vertices)
+        with outside_transforms():
+            vertices, faces = _as_tensors(vertices, faces)
+            _validate(vertices, faces)
+            # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
+            self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
 
     def _assign(
         self,
@@ -146,6 +148,7 @@ class Mesh:
                 f"Mesh.with_vertices: expected {tuple(self.vertices.shape)} {self.dtype} on "
                 f"{self.device}, got {tuple(vertices.shape)} {vertices.dtype} on {vertices.device}"
             )
+        _require_constant(vertices)
         _validate(vertices, self.faces)
         moved = object.__new__(Mesh)
         moved._assign(vertices.clone(), self.faces, self.vertex_offsets, self.face_offsets)
@@ -164,22 +167,22 @@ class Mesh:
 
     # ---------------------------------------------------------------- geometry
 
-    @cached_property
+    @constant_property
     def _corners(self) -> Float[Tensor, "m k D"]:
         """Float64 positions of the corners of each cell."""
         return self.vertices.double()[self.faces]
 
-    @cached_property
+    @constant_property
     def _double_measures(self) -> Float[Tensor, "m"]:
         """Float64 measures, for operators assembled in double whatever the mesh's dtype."""
         return cells.measures(self._corners)
 
-    @cached_property
+    @constant_property
     def _double_frames(self) -> Float[Tensor, "m D d"]:
         """Float64 frames (see `frames`)."""
         return cells.frames(self._corners)
 
-    @cached_property
+    @constant_property
     def measures(self) -> Float[Tensor, "m"]:
         """Area of each triangle in units², or volume of each tetrahedron in units³; positive."""
         return self._double_measures.to(self.dtype)
@@ -197,13 +200,13 @@ class Mesh:
             raise MeshError("volumes need tetrahedra: faces are (m, 3), not (m, 4)")
         return self.measures
 
-    @cached_property
+    @constant_property
     def normals(self) -> Float[Tensor, "m 3"]:
         """Unit normal of each triangle; only in space."""
         vectors = self._area_vectors("normals")
         return (vectors / torch.linalg.vector_norm(vectors, dim=1, keepdim=True)).to(self.dtype)
 
-    @cached_property
+    @constant_property
     def frames(self) -> Float[Tensor, "m D d"]:
         """Orthonormal, oriented basis B of each tangent plane as columns: B₁ × B₂ = normal.
 
@@ -212,17 +215,17 @@ class Mesh:
         """
         return self._double_frames.to(self.dtype)
 
-    @cached_property
+    @constant_property
     def centroids(self) -> Float[Tensor, "m D"]:
         """Barycentre of each cell."""
         return self.vertices[self.faces].mean(dim=1)
 
-    @cached_property
+    @constant_property
     def _double_vertex_measures(self) -> Float[Tensor, "n"]:
         """Float64 vertex measures (see `vertex_measures`)."""
         return self.sum_at_vertices(self._double_measures[:, None] / self.faces.shape[1])[:, 0]
 
-    @cached_property
+    @constant_property
     def vertex_measures(self) -> Float[Tensor, "n"]:
         """Lumped mass: an equal share of the measure of each cell around a vertex."""
         return self._double_vertex_measures.to(self.dtype)
@@ -233,7 +236,7 @@ class Mesh:
         self._require_triangles("vertex_areas")
         return self.vertex_measures
 
-    @cached_property
+    @constant_property
     def vertex_normals(self) -> Float[Tensor, "n 3"]:
         """Unit vertex normals, the faces' weighted by area; zero where those cancel."""
         total = self.sum_at_vertices(self._area_vectors("vertex_normals"))
@@ -259,7 +262,7 @@ class Mesh:
 
     # ---------------------------------------------------------------- topology
 
-    @cached_property
+    @constant_property
     def components(self) -> Int[Tensor, "n"]:
         """Label in 0 … n_components - 1 of the connected component of each vertex."""
         labels = topology.component_labels(self._numpy_faces, self.n_vertices)
@@ -270,20 +273,20 @@ class Mesh:
         """Number of connected components; cells that share a vertex are connected."""
         return int(self.components.max()) + 1
 
-    @cached_property
+    @constant_property
     def euler_characteristic(self) -> int:
         """V - E + F of a triangle mesh."""
         self._require_triangles("euler_characteristic")
         n_edges = len(topology.undirected_edges(self._numpy_faces)[0])
         return self.n_vertices - n_edges + self.n_faces
 
-    @cached_property
+    @constant_property
     def is_manifold(self) -> bool:
         """Whether edges have at most two, consistently oriented faces and vertices one fan."""
         self._require_triangles("is_manifold")
         return topology.is_manifold(self._numpy_faces, self.n_vertices)
 
-    @cached_property
+    @constant_property
     def boundary_loops(self) -> list[Tensor]:
         """Each boundary as its cycle of vertices, along the faces' edges, longest first.
 
@@ -309,7 +312,7 @@ class Mesh:
             )
         return [torch.from_numpy(loop).to(self.device) for loop in topology.cycles(tails, heads)]
 
-    @cached_property
+    @constant_property
     def is_disk(self) -> bool:
         """Whether the mesh is a disk: connected, manifold, χ = 1 (hence one boundary)."""
         return self.n_components == 1 and self.is_manifold and self.euler_characteristic == 1
@@ -349,12 +352,12 @@ class Mesh:
         """Number of meshes that were concatenated; 1 for a mesh built from arrays."""
         return len(self.face_offsets) - 1
 
-    @cached_property
+    @constant_property
     def part_of_vertex(self) -> Int[Tensor, "n"]:
         """The part each vertex belongs to."""
         return _owners(self.vertex_offsets, self.device)
 
-    @cached_property
+    @constant_property
     def part_of_face(self) -> Int[Tensor, "m"]:
         """The part each face belongs to."""
         return _owners(self.face_offsets, self.device)
@@ -387,6 +390,7 @@ class Mesh:
         Raises:
             MeshError: wrong shape or dtype, or no face is left.
         """
+        _require_constant(vertices)
         vertices, faces = _as_tensors(vertices, faces)
         _check_arrays(vertices, faces)
         merged = torch.arange(len(vertices), device=vertices.device)
@@ -433,6 +437,15 @@ def _is_integer(values: Tensor) -> bool:
     return not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
 
 
+def _require_constant(vertices: ArrayLike) -> None:
+    if isinstance(vertices, Tensor) and (vertices.requires_grad or is_transformed(vertices)):
+        raise MeshError(
+            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
+            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
+            "the solver"
+        )
+
+
 def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
     """Shapes and dtypes: what even `Mesh.cleaned` cannot repair."""
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
@@ -440,12 +453,6 @@ def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
     if vertices.dtype not in (torch.float32, torch.float64):
         raise MeshError(
             f"Mesh: vertices must be float32 or float64, got {vertices.dtype}; convert them"
-        )
-    if vertices.requires_grad:
-        raise MeshError(
-            "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
-            "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "
-            "the solver"
         )
     if faces.ndim != 2 or faces.shape[1] not in (3, 4):
         raise MeshError(

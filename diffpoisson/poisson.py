@@ -39,8 +39,9 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix, require_equal
+from diffpoisson.linear_map import LinearMap, Matrix
 from diffpoisson.mesh import Mesh
+from diffpoisson.transforms import outside_transforms, require_equal
 
 
 class PoissonSolver:
@@ -78,18 +79,19 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
-        constraints = Constraints.build(
-            mesh,
-            gauge=gauge,
-            pins=pins,
-            handles=handles,
-            handle_weights=handle_weights,
-            face_weights=face_weights,
-        )
-        free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
-        divergence, L = _assemble(mesh, constraints)
-        factor = CholeskyFactor(L[free][:, free], mesh.device)
-        self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+        with outside_transforms():
+            constraints = Constraints.build(
+                mesh,
+                gauge=gauge,
+                pins=pins,
+                handles=handles,
+                handle_weights=handle_weights,
+                face_weights=face_weights,
+            )
+            free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
+            divergence, L = _assemble(mesh, constraints)
+            factor = CholeskyFactor(L[free][:, free], mesh.device)
+            self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
         self,
@@ -202,10 +204,14 @@ class PoissonSolver:
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        pull = constraints.handle_weights[:, None] * q_handles
-
-        b = self._divergence(matrices_to_columns(intrinsic)) - self._coupling(q_pins)
-        phi = self._scattered(self._inverse(b.index_add(0, self._handle_rows, pull)), q_pins)
+        b = self._divergence(matrices_to_columns(intrinsic))
+        if q_pins is not None:
+            b = b - self._coupling(q_pins)
+        pull = None
+        if q_handles is not None:
+            pull = constraints.handle_weights[:, None] * q_handles
+            b = b.index_add(0, self._handle_rows, pull)
+        phi = self._scattered(self._inverse(b), q_pins)
         means = self._mean_weights
         if geometry is not None:
             for _ in range(order):
@@ -227,28 +233,32 @@ class PoissonSolver:
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
                 f"got {tuple(b.shape)}"
             )
-        x = self._inverse(b[self.constraints.free].double())
-        return self._scattered(x, x.new_zeros(len(self.constraints.pins), b.shape[1])).to(b.dtype)
+        return self._scattered(self._inverse(b[self.constraints.free].double())).to(b.dtype)
 
     # ---------------------------------------------------------------- steps of a solve
 
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
-    ) -> Float[Tensor, "count k"]:
-        """Given images as columns; none for no constraints."""
+    ) -> Float[Tensor, "count k"] | None:
+        """Given images as columns; None if there are none to give."""
         if (values is None) != (count == 0):
             verb = "missing" if values is None else "given"
             raise ValueError(f"PoissonSolver: images {verb} for {count} {name}")
-        if values is None:
-            return self._frames.new_zeros(0, batch.numel() * c)
+        return None if values is None else self._columns(name, values, count, batch, c)
+
+    def _columns(
+        self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
+    ) -> Float[Tensor, "count k"]:
         _require_shape(name, values, batch, (count, c))
         return vertices_to_columns(values.double().expand(*batch, count, c))
 
-    def _scattered(self, x: Tensor, q_pins: Tensor) -> Float[Tensor, "n k"]:
-        """Values at the free vertices and pins, zero at the anchors."""
+    def _scattered(
+        self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None
+    ) -> Float[Tensor, "n k"]:
+        """Values at the free vertices and, if given, at the pins; zero elsewhere."""
         phi = x.new_zeros(self.mesh.n_vertices, x.shape[1])
         phi = phi.index_copy(0, self.constraints.free, x)
-        return phi.index_copy(0, self.constraints.pins, q_pins)
+        return phi if q_pins is None else phi.index_copy(0, self.constraints.pins, q_pins)
 
     def _placed(
         self,
@@ -264,8 +274,8 @@ class PoissonSolver:
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
         if translations is not None:
-            q = self._given("floating components", translations, self.n_floating, batch, c)
-            shifts = shifts + torch.cat([q, q.new_zeros(1, q.shape[1])])
+            q = self._columns("translations", translations, self.n_floating, batch, c)
+            shifts = torch.cat([shifts[:-1] + q, shifts[-1:]])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
@@ -296,15 +306,17 @@ class PoissonSolver:
         face_weights: Tensor | None,
         phi: Float[Tensor, "n k"],
         R: Float[Tensor, "*batch m c d"],
-        pull: Float[Tensor, "h k"],
+        pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "f k"]:
         """b(v) - (L(v) + W) Φ at the free vertices."""
         constraints = self.constraints
         weights = constraints.face_weights if face_weights is None else face_weights.double()
         misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
         fit = vertices_to_columns(geometry.divergence(misfit, weights))
-        held = constraints.handle_weights[:, None] * phi[constraints.handles]
-        return fit.index_add(0, constraints.handles, pull - held)[constraints.free]
+        if pull is not None:
+            held = constraints.handle_weights[:, None] * phi[constraints.handles]
+            fit = fit.index_add(0, constraints.handles, pull - held)
+        return fit[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints

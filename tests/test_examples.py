@@ -26,6 +26,13 @@ def test_uv_train(tmp_path, monkeypatch):
     assert (tmp_path / "run" / "results.png").stat().st_size > 100_000
 
 
+def test_tables_are_those_of_the_results():
+    script = runpy.run_path(str(ROOT / "docs" / "update_tables.py"))
+    text = (ROOT / "README.md").read_text()
+    assert "<!-- table:uv_train -->" in text
+    assert script["updated"](text) == text
+
+
 def test_readme_example():
     block = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert block is not None

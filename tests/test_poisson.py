@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given
-from torch.func import grad, hessian, jacfwd, jacrev, vmap
+from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
 import diffpoisson as dp
 from tests import checks, meshes, references
@@ -230,3 +230,47 @@ def test_updating_a_union_keeps_its_constraints():
         free.update(moved[1])(R[pinned.mesh.n_faces :]),
     ]
     assert_near(union(R, pins=images), torch.cat(expected), SOLVE)
+
+
+@pytest.mark.parametrize("transform", ["grad", "jvp", "hessian", "vmap", "inference"])
+def test_first_use_inside_a_transform_leaves_no_trace(transform):
+    """Mesh, operators and factor made inside: the same numbers, and usable afterwards."""
+    vertices, faces = meshes.disk()
+    expected = dp.PoissonSolver(dp.Mesh(vertices, faces))
+    R = field(expected.mesh, c=2)
+    kept = []
+
+    def energy(R):
+        mesh = dp.Mesh(vertices, faces)
+        solver = dp.PoissonSolver(mesh)
+        kept.append((mesh, solver))
+        return dp.jacobians(mesh, solver(R), extrinsic=True).sin().sum() + mesh.normals.sum()
+
+    def known(R):
+        J = dp.jacobians(expected.mesh, expected(R), extrinsic=True)
+        return J.sin().sum() + expected.mesh.normals.sum()
+
+    def apply(function):
+        if transform == "grad":
+            return grad(function)(R)
+        if transform == "jvp":
+            return jvp(function, (R,), (R.cos(),))[1]
+        if transform == "hessian":
+            return hessian(lambda t: function(t * R))(torch.ones(2, 1, dtype=R.dtype))
+        if transform == "vmap":
+            return vmap(function)(torch.stack([R, 2 * R]))
+        with torch.inference_mode():
+            return function(R)
+
+    assert_near(apply(energy), apply(known), SOLVE)
+    mesh, solver = kept[0]
+    R = R.clone().requires_grad_()
+    (dp.jacobians(mesh, solver(R)) * mesh.frames[:, :2]).sum().backward()
+    assert R.grad.isfinite().all()
+
+
+def test_a_mesh_of_differentiated_vertices_raises():
+    vertices, faces = meshes.disk()
+    R = field(dp.Mesh(vertices, faces), c=2)
+    with pytest.raises(dp.MeshError, match="vertices require grad"):
+        grad(lambda v: dp.solve_poisson(dp.Mesh(v, faces), R).sum())(torch.from_numpy(vertices))

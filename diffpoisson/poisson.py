@@ -61,8 +61,8 @@ class PoissonSolver:
 
     Raises:
         ValueError: indices out of range, named twice, or both pinned and handles; every vertex
-            pinned; weights that are negative or not finite; a vertex that only faces of weight zero
-            touch; a gauge mask that misses a component.
+            pinned; weights that are negative, not finite, or that require grad; a vertex that only
+            faces of weight zero touch; a gauge mask that misses a component.
     """
 
     def __init__(
@@ -192,9 +192,10 @@ class PoissonSolver:
         geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
-        if transforms is not None:
-            intrinsic = transforms.double() @ intrinsic
         batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
+        if transforms is not None:
+            _require_shape("transforms", transforms, batch, (self.mesh.n_faces, c, c))
+            intrinsic = transforms.double() @ intrinsic
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
@@ -247,11 +248,7 @@ class PoissonSolver:
     def _columns(
         self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
     ) -> Float[Tensor, "count k"]:
-        if values.shape[-2:] != (count, c):
-            raise ValueError(
-                f"PoissonSolver: expected {name} of shape (…, {count}, {c}), "
-                f"got {tuple(values.shape)}"
-            )
+        _require_shape(name, values, batch, (count, c))
         return vertices_to_columns(values.double().expand(*batch, count, c))
 
     def _scattered(
@@ -340,6 +337,22 @@ def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) 
         if options.get(name) is not None:
             options[name], images[name] = options[name]
     return PoissonSolver(mesh, **options)(R, **images)
+
+
+def _require_shape(name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...]) -> None:
+    """Raise unless values are (*batch, *shape), or have batch dimensions that broadcast to it."""
+    given = values.shape[: -len(shape)]
+    broadcast = zip(reversed(given), reversed(batch), strict=False)
+    if (
+        values.shape[-len(shape) :] != shape
+        or len(given) > len(batch)
+        or any(size not in (1, full) for size, full in broadcast)
+    ):
+        expected = ", ".join(map(str, shape))
+        raise ValueError(
+            f"PoissonSolver: expected {name} of shape (…, {expected}), with … broadcasting to the "
+            f"batch {tuple(batch)} of R, got {tuple(values.shape)}"
+        )
 
 
 def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.csr_matrix]:

@@ -83,6 +83,12 @@ class Constraints:
         free = solved.nonzero()[:, 0]
         return cls(pinned, handled, strengths, weights, free, floating, n_floating, mask)
 
+    @property
+    def natural(self) -> bool:
+        """Whether the matrix is the mesh's Laplacian: no pins, handles or face weights."""
+        held = len(self.pins) + len(self.handles) > 0
+        return not held and bool((self.face_weights == 1).all())
+
     @classmethod
     def concatenate(cls, parts: Sequence[Constraints]) -> Constraints:
         """The constraints of the disjoint union of the meshes."""
@@ -156,11 +162,11 @@ def _vertex_indices(mesh: Mesh, name: str, indices: Tensor | None) -> Int[Tensor
     values, counts = indices.unique(return_counts=True)
     if (counts > 1).any():
         _fail(f"{name} name {describe_indices(values[counts > 1], 'vertex', 'vertices')} twice")
-    return indices.long()
+    return indices.long().clone()  # later edits by the caller must not reach the factor
 
 
 def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Tensor, "h"]:
-    strengths = to_tensor("PoissonSolver", "handle_weights", weights, mesh.device).double()
+    strengths = _constant("handle_weights", weights, mesh)
     if strengths.shape not in ((), handles.shape):
         _fail(
             f"handle_weights must be a number or of shape ({len(handles)},), got "
@@ -172,10 +178,22 @@ def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Te
     return strengths
 
 
+def _constant(name: str, values: Tensor | float, mesh: Mesh) -> Tensor:
+    """A float64 copy, of what has no derivative."""
+    values = to_tensor("PoissonSolver", name, values, mesh.device)
+    if values.requires_grad:
+        _fail(
+            f"{name} require grad, but a factor is constant, so their gradient would silently be "
+            f"wrong; pass {name}.detach() here, and face_weights=... to the solver's call if "
+            "derivatives by them are wanted"
+        )
+    return values.double().clone()
+
+
 def _face_weights(mesh: Mesh, weights: Tensor | None) -> Float[Tensor, "m"]:
     if weights is None:
         return torch.ones(mesh.n_faces, dtype=torch.float64, device=mesh.device)
-    weights = to_tensor("PoissonSolver", "face_weights", weights, mesh.device).detach().double()
+    weights = _constant("face_weights", weights, mesh)
     if weights.shape != (mesh.n_faces,):
         _fail(f"face_weights must be of shape (m={mesh.n_faces},), got {tuple(weights.shape)}")
     bad = ~((weights >= 0) & weights.isfinite())

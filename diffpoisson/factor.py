@@ -15,7 +15,7 @@ from torch import Tensor
 
 from diffpoisson.linear_map import Matrix
 
-_MAX_CUDA_COLUMNS = 128  # cholespy's limit for one call on a GPU
+_MAX_COLUMNS = {"cuda": 128}  # cholespy's limits for one call
 
 
 class CholeskyFactor(Matrix):
@@ -69,7 +69,7 @@ class CholeskyFactor(Matrix):
             )
         if x.device != self._device:
             raise ValueError(f"CholeskyFactor: x is on {x.device}, the factor on {self._device}")
-        width = _MAX_CUDA_COLUMNS if x.is_cuda else max(x.shape[1], 1)
+        width = _MAX_COLUMNS.get(x.device.type, max(x.shape[1], 1))
         return torch.cat([self._solve(chunk) for chunk in x.split(width, dim=1)], dim=1).to(x.dtype)
 
     def _solve(self, b: Tensor) -> Tensor:

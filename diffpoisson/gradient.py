@@ -254,6 +254,10 @@ class CellGeometry(NamedTuple):
         zeros = at_corners.new_zeros(*R.shape[:-3], self.mesh.n_vertices, R.shape[-2])
         return zeros.index_add(-2, self.mesh.faces.flatten(), at_corners.flatten(-3, -2))
 
+    def stiffness(self, weights: Float[Tensor, "m"]) -> Float[Tensor, "m k k"]:
+        """The matrix of each cell in L = ∇ᵀA∇, with the weights in A."""
+        return (self.measures * weights)[:, None, None] * (self.hats.mT @ self.hats)
+
     def vertex_measures(self) -> Float[Tensor, "n"]:
         """An equal share of the measure of each cell around a vertex."""
         shares = self.measures[:, None] / self.mesh.faces.shape[1]

@@ -8,13 +8,9 @@ with neither pin nor handle is determined up to a translation, so one vertex of 
 eliminated too, and the gauge fixes the translation. What remains is positive definite, and
 factorised once.
 
-Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For
-positions v with the same values that require grad, k steps of refinement
-
-    Φ ← Φ + F⁻¹ (b(v) - L(v) Φ)
-
-change no value, but make the result's derivatives by v exact up to order k: each step turns an
-error of order j in a perturbation of v into one of order j + 1.
+Derivatives by the geometry. Positions or face weights that require grad may be given again to a
+solve. Value and factor stay the same, and the solve is differentiated as a function of L and the
+right-hand side: each derivative is one more solve with the factor, exact to any order.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells
-from diffpoisson.arguments import require_instances, require_integer, require_tensor
+from diffpoisson.arguments import require_instances, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -41,7 +37,7 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix
+from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.transforms import outside_transforms, require_equal
 
@@ -67,8 +63,8 @@ class PoissonSolver:
 
     Raises:
         ValueError: indices out of range, named twice, or both pinned and handles; every vertex
-            pinned; weights that are negative or not finite; a vertex that only faces of weight zero
-            touch; a gauge mask that misses a component.
+            pinned; weights that are negative, not finite, or that require grad; a vertex that only
+            faces of weight zero touch; a gauge mask that misses a component.
         MeshError: faces so thin that rounding makes the Laplacian indefinite.
     """
 
@@ -114,6 +110,8 @@ class PoissonSolver:
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
+        rows = torch.where(free_index < 0, len(constraints.free), free_index)
+        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
         self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
@@ -174,7 +172,6 @@ class PoissonSolver:
         transforms: Float[Tensor, "*#batch m c c"] | None = None,
         vertices: Float[Tensor, "n D"] | None = None,
         face_weights: Float[Tensor, "m"] | None = None,
-        order: int = 1,
     ) -> Float[Tensor, "*batch n c"]:
         """The map whose Jacobians are closest to R in the area-weighted least-squares sense.
 
@@ -189,8 +186,6 @@ class PoissonSolver:
             vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
             face_weights: (m,) the solver's own face weights again, if derivatives by them are
                 wanted.
-            order: up to which order derivatives by `vertices` and `face_weights` are exact; each
-                order costs one more solve. Higher derivatives are wrong, so do not take them.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
@@ -201,29 +196,36 @@ class PoissonSolver:
             TypeError: what should be a tensor is none, or not of floating dtype.
         """
         require_tensor("PoissonSolver", "R", R, self.mesh.device)
-        geometry = self._moving_geometry(vertices, face_weights, order)
+        geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
-        if transforms is not None:
-            intrinsic = self._transformed(transforms, intrinsic)
         batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
+        if transforms is not None:
+            _require_shape(
+                "transforms", transforms, batch, (self.mesh.n_faces, c, c), self.mesh.device
+            )
+            intrinsic = transforms.double() @ intrinsic
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        b = self._divergence(matrices_to_columns(intrinsic))
-        if q_pins is not None:
-            b = b - self._coupling(q_pins)
         pull = None
         if q_handles is not None:
             pull = constraints.handle_weights[:, None] * q_handles
-            b = b.index_add(0, self._handle_rows, pull)
-        phi = self._scattered(self._inverse(b), q_pins)
-        means = self._mean_weights
-        if geometry is not None:
-            for _ in range(order):
-                residual = self._residual(geometry, face_weights, phi, intrinsic, pull)
-                phi = phi.index_add(0, constraints.free, self._inverse(residual))
+
+        if geometry is None:
+            b = self._divergence(matrices_to_columns(intrinsic))
+            if q_pins is not None:
+                b = b - self._coupling(q_pins)
+            if pull is not None:
+                b = b.index_add(0, self._handle_rows, pull)
+            x = self._inverse(b)
+            means = self._mean_weights
+        else:
+            weights = constraints.face_weights if face_weights is None else face_weights.double()
+            b = self._right_hand_side(geometry, weights, intrinsic, q_pins, pull)
+            x = self._moving_inverse(geometry.stiffness(weights), b)
             means = constraints.mean_weights(geometry.vertex_measures())
+        phi = self._scattered(x, q_pins)
         phi = self._placed(phi, means, translations, batch, c)
         return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
@@ -256,27 +258,8 @@ class PoissonSolver:
     def _columns(
         self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
     ) -> Float[Tensor, "count k"]:
-        require_tensor("PoissonSolver", name, values, self.mesh.device)
-        if values.shape[-2:] != (count, c) or not _expands(values.shape[:-2], batch):
-            raise ValueError(
-                f"PoissonSolver: expected {name} of shape (…, {count}, {c}), the … broadcasting "
-                f"to {tuple(batch)}, got {tuple(values.shape)}"
-            )
+        _require_shape(name, values, batch, (count, c), self.mesh.device)
         return vertices_to_columns(values.double().expand(*batch, count, c))
-
-    def _transformed(
-        self, transforms: Tensor, R: Float[Tensor, "*batch m c d"]
-    ) -> Float[Tensor, "*batch m c d"]:
-        """The transforms times R."""
-        require_tensor("PoissonSolver", "transforms", transforms, self.mesh.device)
-        m, c = R.shape[-3:-1]
-        both = zip(transforms.shape[-4::-1], R.shape[-4::-1], strict=False)
-        if transforms.shape[-3:] != (m, c, c) or any(a != b and 1 not in (a, b) for a, b in both):
-            raise ValueError(
-                f"PoissonSolver: expected transforms of shape (…, m={m}, {c}, {c}), the … "
-                f"broadcasting with {tuple(R.shape[:-3])}, got {tuple(transforms.shape)}"
-            )
-        return transforms.double() @ R
 
     def _scattered(
         self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None
@@ -309,42 +292,42 @@ class PoissonSolver:
     # ---------------------------------------------------------------- derivatives by the geometry
 
     def _moving_geometry(
-        self, vertices: Tensor | None, face_weights: Tensor | None, order: int
+        self, vertices: Tensor | None, face_weights: Tensor | None
     ) -> CellGeometry | None:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        require_integer("PoissonSolver", "order", order, least=0)
         own = (self.mesh.vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
                 require_tensor("PoissonSolver", name, yours, self.mesh.device)
                 require_equal(
-                    yours.to(mine.dtype),
-                    mine,
+                    yours.double(),
+                    mine.double(),
                     f"PoissonSolver: {name} differ from those that were factorised; solve with "
                     "solver.update(vertices), or with a solver of these weights",
                 )
         return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
 
-    def _residual(
+    def _right_hand_side(
         self,
         geometry: CellGeometry,
-        face_weights: Tensor | None,
-        phi: Float[Tensor, "n k"],
+        weights: Float[Tensor, "m"],
         R: Float[Tensor, "*batch m c d"],
+        q_pins: Float[Tensor, "p k"] | None,
         pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "f k"]:
-        """b(v) - (L(v) + W) Φ at the free vertices."""
+        """∇ᵀA (R - ∇Φ) + W q at the free vertices, where Φ is zero but at the pins."""
         constraints = self.constraints
-        weights = constraints.face_weights if face_weights is None else face_weights.double()
-        misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
-        fit = vertices_to_columns(geometry.divergence(misfit, weights))
+        if q_pins is not None:
+            held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
+            held = held.index_copy(0, constraints.pins, q_pins)
+            R = R - geometry.gradient(columns_to_vertices(held, R.shape))
+        b = vertices_to_columns(geometry.divergence(R, weights))
         if pull is not None:
-            held = constraints.handle_weights[:, None] * phi[constraints.handles]
-            fit = fit.index_add(0, constraints.handles, pull - held)
-        return fit[constraints.free]
+            b = b.index_add(0, constraints.handles, pull)
+        return b[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints
@@ -369,12 +352,6 @@ def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) 
     return PoissonSolver(mesh, **options)(R, **images)
 
 
-def _expands(shape: torch.Size, batch: torch.Size) -> bool:
-    """Whether dimensions broadcast to given ones, without changing those."""
-    pairs = zip(reversed(shape), reversed(batch), strict=False)
-    return len(shape) <= len(batch) and all(size in (1, total) for size, total in pairs)
-
-
 def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
     """The factor of what is positive definite but for rounding."""
     try:
@@ -387,6 +364,25 @@ def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
             f"thinnest face, {worst}, has a height of {float(thinness[worst]):.0e} of its longest "
             f"edge: remesh such faces, or bring weights closer together ({error})"
         ) from error
+
+
+def _require_shape(
+    name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...], device: torch.device
+) -> None:
+    """Raise unless values are (*batch, *shape), or have batch dimensions that broadcast to it."""
+    require_tensor("PoissonSolver", name, values, device)
+    given = values.shape[: -len(shape)]
+    broadcast = zip(reversed(given), reversed(batch), strict=False)
+    if (
+        values.shape[-len(shape) :] != shape
+        or len(given) > len(batch)
+        or any(size not in (1, full) for size, full in broadcast)
+    ):
+        expected = ", ".join(map(str, shape))
+        raise ValueError(
+            f"PoissonSolver: expected {name} of shape (…, {expected}), with … broadcasting to the "
+            f"batch {tuple(batch)} of R, got {tuple(values.shape)}"
+        )
 
 
 def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.csr_matrix]:

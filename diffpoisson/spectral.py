@@ -46,11 +46,12 @@ def laplacian_eigenpairs(
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
 
     Returns:
-        eigenvalues (k,) in 1/units², eigenvectors (n, k) in 1/units; in the dtype of the mesh.
+        eigenvalues (k,) in 1/units², eigenvectors (n, k) in 1/units (of tetrahedra, units^-3/2); in
+        the dtype of the mesh.
 
     Raises:
         MeshError: the mesh has fewer than k vertices.
-        ValueError: the solver is another mesh's.
+        ValueError: the solver is another mesh's, or has pins, handles or face weights.
     """
     require_mesh("laplacian_eigenpairs", mesh)
     require_integer("laplacian_eigenpairs", "n_eigenpairs", n_eigenpairs)
@@ -61,6 +62,11 @@ def laplacian_eigenpairs(
         )
     if solver is not None and solver.mesh is not mesh:
         raise ValueError("laplacian_eigenpairs: the solver belongs to another mesh; pass its own")
+    if solver is not None and not solver.constraints.natural:
+        raise ValueError(
+            "laplacian_eigenpairs: the solver has pins, handles or face weights, so its matrix is "
+            "not the Laplacian; pass one without"
+        )
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
     # Of total one, so that no scale is too large or small for ARPACK's tolerances.
     total = areas.sum()
@@ -81,17 +87,19 @@ def laplacian_eigenpairs(
 
 
 def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
-    """Area of each vertex's cell, positive, summing to the area of the mesh, in units².
+    """Measure of each vertex's cell, positive, summing to that of the mesh, in units² or units³.
 
     Raises:
         ValueError: unknown kind of mass.
+        MeshError: Voronoi areas of tetrahedra.
     """
     require_mesh("lumped_mass", mesh)
     if mass == "barycentric":
-        return mesh.vertex_areas
+        return mesh.vertex_measures
     if mass != "voronoi":
         raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
-    shares = _voronoi_shares(mesh.vertices.double()[mesh.faces]) * mesh.areas.double()[:, None]
+    areas = mesh.areas.double()[:, None]
+    shares = areas * _voronoi_shares(mesh.vertices.double()[mesh.faces])
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
     return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)
 
@@ -140,7 +148,7 @@ def wave_kernel_signature(
     )
     signature = vectors[:, mesh.n_components :].double() ** 2 @ weights
     if scale_invariant:
-        signature = signature * mesh.areas.double().sum()
+        signature = signature * mesh.measures.double().sum()
     return signature.to(mesh.dtype)
 
 

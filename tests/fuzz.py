@@ -436,7 +436,7 @@ def _draw_solve(rng: Rng) -> Arguments:
     if rng.random() < 0.2:
         a["translations"] = torch.from_numpy(rng.normal(size=(solver.n_floating, c)))
     if rng.random() < 0.2:
-        a["vertices"], a["order"] = m.vertices.clone(), 1
+        a["vertices"] = m.vertices.clone()
     return a
 
 
@@ -453,7 +453,6 @@ def _draw_transformed(rng: Rng) -> Arguments:
         "R": R,
         "transforms": torch.from_numpy(rng.normal(size=(m.n_faces, c, c))),
         "face_weights": torch.ones(m.n_faces, dtype=torch.float64),
-        "order": int(rng.integers(0, 3)),
     }
 
 

@@ -50,7 +50,7 @@ def laplacian_eigenpairs(
         the dtype of the mesh.
 
     Raises:
-        MeshError: the mesh has fewer than k vertices.
+        MeshError: the mesh has fewer than k vertices, or too thin faces.
         ValueError: the solver is another mesh's, or has pins, handles or face weights.
     """
     require_mesh("laplacian_eigenpairs", mesh)
@@ -80,6 +80,11 @@ def laplacian_eigenpairs(
         L = laplacian(mesh).toarray()
         pairs = scipy.linalg.eigh(L, np.diag(areas))
         pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
+        if (pairs[0] <= 0).any():
+            raise MeshError(
+                "laplacian_eigenpairs: rounding hides the smallest eigenvalues behind the largest, "
+                "that of the thinnest faces; remesh these"
+            )
     values = np.concatenate([np.zeros(zeros), pairs[0]])[:n_eigenpairs]
     vectors = np.concatenate([_constants(mesh, areas), pairs[1]], axis=1)[:, :n_eigenpairs]
     values, vectors = values / total, vectors / np.sqrt(total)

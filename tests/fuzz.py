@@ -233,7 +233,7 @@ def check_jacobians(a: Arguments, J: Tensor) -> None:
     width = m.dim if a["extrinsic"] else m.cell_dim
     require(J.shape == (*phi.shape[:-2], m.n_faces, phi.shape[-1], width), "shape")
     require(J.dtype == phi.dtype, "dtype")
-    if not sound(phi, a.get("vertices")) or phi.numel() == 0:
+    if not sound(phi, a.get("vertices"), m.vertices.to(phi.dtype)) or phi.numel() == 0:
         return
     at = dp.Mesh(a["vertices"], m.faces) if a.get("vertices") is not None else m
     start, end = (at.vertices.double()[m.faces[:, i]] for i in (0, 1))

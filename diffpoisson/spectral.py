@@ -99,10 +99,10 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         MeshError: Voronoi areas of tetrahedra.
     """
     require_mesh("lumped_mass", mesh)
+    if not isinstance(mass, str) or mass not in ("barycentric", "voronoi"):
+        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures
-    if mass != "voronoi":
-        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     areas = mesh.areas.double()[:, None]
     shares = areas * _voronoi_shares(mesh.vertices.double()[mesh.faces])
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)

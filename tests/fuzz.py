@@ -268,7 +268,8 @@ def check_solution(a: Arguments, phi: Tensor) -> None:
     require(phi.shape == (*batch, m.n_vertices, R.shape[-2]), "shape")
     require(phi.dtype == R.dtype, "dtype")
     images = (a.get("pins"), a.get("handles"), a.get("translations"))
-    if not sound(R, *images, m.vertices.to(R.dtype)) or R.dtype not in (
+    thin = solver.constraints.face_weights.reciprocal()
+    if not sound(R, *images, m.vertices.to(R.dtype), thin) or R.dtype not in (
         torch.float32,
         torch.float64,
     ):

@@ -196,7 +196,7 @@ def _spatial_sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
 
 def _sqrt(x: Tensor) -> Tensor:
     """√x with subgradient zero at zero."""
-    return torch.where(x > 0, torch.where(x > 0, x, 1).sqrt(), 0)
+    return torch.where(x > 0, torch.where(x > 0, x, 1).sqrt(), 0 * x)  # NaN stays NaN
 
 
 def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:

@@ -8,13 +8,9 @@ with neither pin nor handle is determined up to a translation, so one vertex of 
 eliminated too, and the gauge fixes the translation. What remains is positive definite, and
 factorised once.
 
-Derivatives by the geometry. Let F be the constant factor of L at the mesh's own positions. For
-positions v with the same values that require grad, k steps of refinement
-
-    Φ ← Φ + F⁻¹ (b(v) - L(v) Φ)
-
-change no value, but make the result's derivatives by v exact up to order k: each step turns an
-error of order j in a perturbation of v into one of order j + 1.
+Derivatives by the geometry. Positions or face weights that require grad may be given again to a
+solve. Value and factor stay the same, and the solve is differentiated as a function of L and the
+right-hand side: each derivative is one more solve with the factor, exact to any order.
 """
 
 from __future__ import annotations
@@ -28,6 +24,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffpoisson import cells
+from diffpoisson.arguments import require_instances, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -39,8 +37,8 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import LinearMap, Matrix
-from diffpoisson.mesh import Mesh
+from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.transforms import outside_transforms, require_equal
 
 
@@ -67,6 +65,7 @@ class PoissonSolver:
         ValueError: indices out of range, named twice, or both pinned and handles; every vertex
             pinned; weights that are negative, not finite, or that require grad; a vertex that only
             faces of weight zero touch; a gauge mask that misses a component.
+        MeshError: faces so thin that rounding makes the Laplacian indefinite.
     """
 
     def __init__(
@@ -79,6 +78,7 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
+        require_mesh("PoissonSolver", mesh)
         with outside_transforms():
             constraints = Constraints.build(
                 mesh,
@@ -90,7 +90,7 @@ class PoissonSolver:
             )
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
-            factor = CholeskyFactor(L[free][:, free], mesh.device)
+            factor = _factorised(L[free][:, free], mesh)
             self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
@@ -110,6 +110,8 @@ class PoissonSolver:
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
+        rows = torch.where(free_index < 0, len(constraints.free), free_index)
+        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
         self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
@@ -147,6 +149,7 @@ class PoissonSolver:
             ValueError: some solvers have the gauge "vertex" and others do not.
             MeshError: the meshes differ in dimension, dtype or device.
         """
+        require_instances("PoissonSolver.concatenate", solvers, PoissonSolver)
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
@@ -169,7 +172,6 @@ class PoissonSolver:
         transforms: Float[Tensor, "*#batch m c c"] | None = None,
         vertices: Float[Tensor, "n D"] | None = None,
         face_weights: Float[Tensor, "m"] | None = None,
-        order: int = 1,
     ) -> Float[Tensor, "*batch n c"]:
         """The map whose Jacobians are closest to R in the area-weighted least-squares sense.
 
@@ -184,8 +186,6 @@ class PoissonSolver:
             vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
             face_weights: (m,) the solver's own face weights again, if derivatives by them are
                 wanted.
-            order: up to which order derivatives by `vertices` and `face_weights` are exact; each
-                order costs one more solve. Higher derivatives are wrong, so do not take them.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
@@ -193,31 +193,39 @@ class PoissonSolver:
         Raises:
             ValueError: shapes that do not fit; images missing for pins or handles, or given
                 without; `vertices` or `face_weights` that differ from those that were factorised.
+            TypeError: what should be a tensor is none, or not of floating dtype.
         """
-        geometry = self._moving_geometry(vertices, face_weights, order)
+        require_tensor("PoissonSolver", "R", R, self.mesh.device)
+        geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
         batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
         if transforms is not None:
-            _require_shape("transforms", transforms, batch, (self.mesh.n_faces, c, c))
+            _require_shape(
+                "transforms", transforms, batch, (self.mesh.n_faces, c, c), self.mesh.device
+            )
             intrinsic = transforms.double() @ intrinsic
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
         q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        b = self._divergence(matrices_to_columns(intrinsic))
-        if q_pins is not None:
-            b = b - self._coupling(q_pins)
         pull = None
         if q_handles is not None:
             pull = constraints.handle_weights[:, None] * q_handles
-            b = b.index_add(0, self._handle_rows, pull)
-        phi = self._scattered(self._inverse(b), q_pins)
-        means = self._mean_weights
-        if geometry is not None:
-            for _ in range(order):
-                residual = self._residual(geometry, face_weights, phi, intrinsic, pull)
-                phi = phi.index_add(0, constraints.free, self._inverse(residual))
+
+        if geometry is None:
+            b = self._divergence(matrices_to_columns(intrinsic))
+            if q_pins is not None:
+                b = b - self._coupling(q_pins)
+            if pull is not None:
+                b = b.index_add(0, self._handle_rows, pull)
+            x = self._inverse(b)
+            means = self._mean_weights
+        else:
+            weights = constraints.face_weights if face_weights is None else face_weights.double()
+            b = self._right_hand_side(geometry, weights, intrinsic, q_pins, pull)
+            x = self._moving_inverse(geometry.stiffness(weights), b)
             means = constraints.mean_weights(geometry.vertex_measures())
+        phi = self._scattered(x, q_pins)
         phi = self._placed(phi, means, translations, batch, c)
         return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
@@ -228,6 +236,7 @@ class PoissonSolver:
             b: (n, k) right-hand sides; over each floating component they must sum to zero, or no
                 solution exists. The rows of anchors and pins are not read.
         """
+        require_tensor("solve_laplacian", "b", b, self.mesh.device)
         if b.ndim != 2 or len(b) != self.mesh.n_vertices:
             raise ValueError(
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
@@ -249,7 +258,7 @@ class PoissonSolver:
     def _columns(
         self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
     ) -> Float[Tensor, "count k"]:
-        _require_shape(name, values, batch, (count, c))
+        _require_shape(name, values, batch, (count, c), self.mesh.device)
         return vertices_to_columns(values.double().expand(*batch, count, c))
 
     def _scattered(
@@ -273,50 +282,52 @@ class PoissonSolver:
         shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
+        shifts = shifts[:-1]
         if translations is not None:
-            q = self._columns("translations", translations, self.n_floating, batch, c)
-            shifts = torch.cat([shifts[:-1] + q, shifts[-1:]])
+            shifts = shifts + self._columns("translations", translations, self.n_floating, batch, c)
+        # What is held stays where it is, and catches no NaN, times zero, from other components.
+        shifts = torch.cat([shifts, shifts.new_zeros(1, shifts.shape[1])])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
 
     def _moving_geometry(
-        self, vertices: Tensor | None, face_weights: Tensor | None, order: int
+        self, vertices: Tensor | None, face_weights: Tensor | None
     ) -> CellGeometry | None:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        if order < 0:
-            raise ValueError(f"PoissonSolver: order must not be negative, got {order}")
         own = (self.mesh.vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
+                require_tensor("PoissonSolver", name, yours, self.mesh.device)
                 require_equal(
-                    yours.to(mine.dtype),
-                    mine,
+                    yours.double(),
+                    mine.double(),
                     f"PoissonSolver: {name} differ from those that were factorised; solve with "
                     "solver.update(vertices), or with a solver of these weights",
                 )
         return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
 
-    def _residual(
+    def _right_hand_side(
         self,
         geometry: CellGeometry,
-        face_weights: Tensor | None,
-        phi: Float[Tensor, "n k"],
+        weights: Float[Tensor, "m"],
         R: Float[Tensor, "*batch m c d"],
+        q_pins: Float[Tensor, "p k"] | None,
         pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "f k"]:
-        """b(v) - (L(v) + W) Φ at the free vertices."""
+        """∇ᵀA (R - ∇Φ) + W q at the free vertices, where Φ is zero but at the pins."""
         constraints = self.constraints
-        weights = constraints.face_weights if face_weights is None else face_weights.double()
-        misfit = R - geometry.gradient(columns_to_vertices(phi, R.shape))
-        fit = vertices_to_columns(geometry.divergence(misfit, weights))
+        if q_pins is not None:
+            held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
+            held = held.index_copy(0, constraints.pins, q_pins)
+            R = R - geometry.gradient(columns_to_vertices(held, R.shape))
+        b = vertices_to_columns(geometry.divergence(R, weights))
         if pull is not None:
-            held = constraints.handle_weights[:, None] * phi[constraints.handles]
-            fit = fit.index_add(0, constraints.handles, pull - held)
-        return fit[constraints.free]
+            b = b.index_add(0, constraints.handles, pull)
+        return b[constraints.free]
 
     def __repr__(self) -> str:
         constraints = self.constraints
@@ -341,8 +352,25 @@ def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) 
     return PoissonSolver(mesh, **options)(R, **images)
 
 
-def _require_shape(name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...]) -> None:
+def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
+    """The factor of what is positive definite but for rounding."""
+    try:
+        return CholeskyFactor(L, mesh.device)
+    except ValueError as error:
+        thinness = cells.thinness(mesh._corners)
+        worst = int(thinness.argmin())
+        raise MeshError(
+            "PoissonSolver: in float64 the Laplacian of this mesh is not positive definite; its "
+            f"thinnest face, {worst}, has a height of {float(thinness[worst]):.0e} of its longest "
+            f"edge: remesh such faces, or bring weights closer together ({error})"
+        ) from error
+
+
+def _require_shape(
+    name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...], device: torch.device
+) -> None:
     """Raise unless values are (*batch, *shape), or have batch dimensions that broadcast to it."""
+    require_tensor("PoissonSolver", name, values, device)
     given = values.shape[: -len(shape)]
     broadcast = zip(reversed(given), reversed(batch), strict=False)
     if (

@@ -18,7 +18,7 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp, linearize, vjp, vmap
 
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import SparseMatrix
-from diffpoisson.linear_map import LinearMap, _apply
+from diffpoisson.linear_map import CellwiseInverse, LinearMap, _apply, _solve
 from tests.checks import assert_near
 
 RTOL = 1e-13
@@ -289,6 +289,105 @@ def test_compiled_by_inductor(compile_):
     actual = x.clone().requires_grad_()
     compile_(loss, "inductor")(actual).backward()
     assert_near(actual.grad, grad(reference)(x), RTOL)
+
+
+# ------------------------------------------------------- a solve whose matrix moves
+
+CELLS = torch.tensor([[0, 1], [1, 2], [2, 3]])  # 3 is no unknown
+
+
+def assembled(K: torch.Tensor) -> torch.Tensor:
+    """Σₑ Pₑᵀ Kₑ Pₑ with dense Pₑ, plus a constant."""
+    P = torch.nn.functional.one_hot(CELLS, 4)[..., :3].double()
+    return torch.einsum("eki,ekl,elj->ij", P, K, P) + torch.eye(3).double()
+
+
+def moving():
+    """The solve; the same by `inv`, as `linalg.solve` errs at second order; K and b."""
+    generator = torch.Generator().manual_seed(0)
+    K = torch.randn(3, 2, 2, generator=generator, dtype=torch.float64)
+    K = K @ K.mT
+    b = torch.randn(3, 2, generator=generator, dtype=torch.float64)
+    solve = CellwiseInverse(CholeskyFactor(sp.csr_matrix(assembled(K).numpy())), CELLS)
+    return solve, lambda K, b: torch.linalg.inv(assembled(K)) @ b, K, b
+
+
+def moving_losses():
+    *solves, K, b = moving()
+
+    def of(solve):
+        return lambda K, b: (solve(K, b**2) ** 3).sum() + solve(K, b).sin().sum()
+
+    return *map(of, solves), K, b
+
+
+def test_moving_value():
+    solve, reference, K, b = moving()
+    assert_near(solve(K, b), reference(K, b), RTOL)
+
+
+@pytest.mark.parametrize("argnums", [0, 1, (0, 1)])
+@pytest.mark.parametrize("nesting", list(itertools.product(TRANSFORMS, repeat=3)), ids="-".join)
+def test_nested_jacobians_of_a_moving_solve(nesting, argnums):
+    """First, second and mixed derivatives by matrix and right-hand side; third by the matrix."""
+    loss, reference, K, b = moving_losses()
+    for order, name in enumerate(nesting):
+        if order == 2:
+            argnums = 0
+        loss, reference = TRANSFORMS[name](loss, argnums), jacrev(reference, argnums)
+        actual, expected = (torch.utils._pytree.tree_leaves(f(K, b)) for f in (loss, reference))
+        for a, e in zip(actual, expected, strict=True):
+            assert_near(a, e, 1e-11)
+
+
+def test_backward_of_order_four_of_a_moving_solve():
+    loss, reference, K, b = moving_losses()
+    actual, expected = K.clone().requires_grad_(), K.clone().requires_grad_()
+    a, e = loss(actual, b), reference(expected, b)
+    for order in range(4):
+        (a,) = torch.autograd.grad(a, actual, create_graph=True)
+        (e,) = torch.autograd.grad(e, expected, create_graph=True)
+        assert_near(a.detach(), e.detach(), RTOL * 10**order)
+        a, e = (a**2).sum(), (e**2).sum()
+
+
+def test_forward_mode_of_a_moving_solve():
+    solve, reference, K, b = moving()
+    tangents = (K.sin(), b.cos())
+    expected = jvp(reference, (K, b), tangents)[1]
+    with forward_ad.dual_level():
+        duals = map(forward_ad.make_dual, (K.requires_grad_(), b), tangents)
+        tangent = forward_ad.unpack_dual(solve(*duals)).tangent
+    assert_near(tangent.detach(), expected.detach(), RTOL)
+    actual, expected = (
+        torch.autograd.grad(jvp(f, (K, b), tangents)[1].square().sum(), K)[0]
+        for f in (solve, reference)
+    )
+    assert_near(actual, expected, 1e-12)
+
+
+def test_vmap_of_a_moving_solve():
+    loss, reference, K, b = moving_losses()
+    batch = torch.stack([b, 2 * b, b.cos()], dim=1)
+    for argnums in (0, 1):
+        actual, expected = (vmap(grad(f, argnums), (None, 1))(K, batch) for f in (loss, reference))
+        assert_near(actual, expected, 1e-12)
+    with pytest.raises(ValueError, match="a batch of matrices under vmap"):
+        vmap(loss, (0, None))(torch.stack([K, K]), b)
+
+
+def test_opcheck_of_a_moving_solve(unchecked):
+    solve, _, K, b = moving()
+    torch.library.opcheck(_solve, (solve._handle, CELLS, K.requires_grad_(), b.requires_grad_()))
+
+
+def test_compiled_moving_solve(compile_):
+    loss, reference, K, b = moving_losses()
+    actual = K.clone().requires_grad_()
+    compile_(loss)(actual, b).backward()
+    assert_near(actual.grad, grad(reference)(K, b), 1e-12)
+    assert_near(compile_(grad(loss))(K, b), grad(reference)(K, b), 1e-12)
+    assert_near(compile_(hessian(loss))(K, b), hessian(reference)(K, b), 1e-11)
 
 
 # ------------------------------------------------------- life time

@@ -440,6 +440,25 @@ def _derivative(curve: Callable, t: Tensor) -> Tensor:
 
 
 @check
+def check_geometry_double_backward() -> None:
+    """Second derivatives by reverse mode twice, by positions, weights, and both."""
+    for intrinsic in (False, True):
+        layer, reference, mesh, weights = geometry_case(intrinsic)
+        y = images(mesh.n_vertices, 2, seed=7)
+        steps = images(mesh.n_vertices), images(mesh.n_faces, 1)[:, 0]
+
+        def curvature(function: Callable) -> tuple[Tensor, ...]:
+            inputs = mesh.vertices.clone().requires_grad_(), weights.clone().requires_grad_()  # noqa: B023
+            loss = (function(*inputs) * y).sum()  # noqa: B023
+            slopes = torch.autograd.grad(loss, inputs, create_graph=True)
+            along = sum((g * u).sum() for g, u in zip(slopes, steps, strict=True))  # noqa: B023
+            return torch.autograd.grad(along, inputs)
+
+        for actual, expected in zip(curvature(layer), curvature(reference), strict=True):
+            assert_near(actual, expected, SOLVE)
+
+
+@check
 def check_geometry_of_the_operators() -> None:
     """Jacobians and divergence as functions of the positions: values and gradients."""
     for build in EVERY:

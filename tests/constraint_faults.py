@@ -10,7 +10,7 @@ import dataclasses
 import scipy.sparse as sp
 import torch
 
-from diffpoisson import cells, constraints, distortion, factor, gradient, poisson
+from diffpoisson import cells, constraints, distortion, factor, gradient, linear_map, poisson
 from tests.faults import Fault, change_system, registrar, wrap, wrap_method
 
 FAULTS: dict[str, Fault] = {}
@@ -292,14 +292,49 @@ def only_the_first_chunk(patch):
 # ------------------------------------------------------- derivatives by the geometry
 
 
+@fault("geometry_gradient")
+def constant_matrix(patch):
+    """Only the right-hand side moves with the vertices, not the Laplacian."""
+
+    def inverse(original, self, K, b):
+        return original(self, K.new_zeros(K.shape), b)
+
+    wrap_method(patch, linear_map.CellwiseInverse, "__call__", inverse)
+
+
+@fault("geometry_gradient")
+def negative_matrix_derivative(patch):
+    """The Laplacian's derivative is added where it should be subtracted, in both modes."""
+    backward, jvp = linear_map._Solve.backward, linear_map._Solve.jvp
+
+    def opposite(ctx, grad):
+        *nothing, K_bar, b_bar = backward(ctx, grad)
+        return (*nothing, -K_bar, b_bar)
+
+    patch.setattr(linear_map._Solve, "backward", staticmethod(opposite))
+    patch.setattr(
+        linear_map._Solve, "jvp", staticmethod(lambda ctx, a, c, K, b: jvp(ctx, a, c, -K, b))
+    )
+
+
 @fault("geometry_derivatives_of_higher_order")
-def one_step_too_few(patch):
-    """Derivatives are exact up to one order less than promised."""
+def constant_geometry_tangent(patch):
+    """Forward mode by the geometry is right once, but its result is not differentiable again."""
+    original, fine = linear_map._Solve.jvp, 2.0**44
+    rounded = staticmethod(lambda *args: torch.round(fine * original(*args)) / fine)
+    patch.setattr(linear_map._Solve, "jvp", rounded)
 
-    def call(original, self, R, *, order=1, **given):
-        return original(self, R, order=order - 1, **given)
 
-    wrap_method(patch, Solver, "__call__", call)
+@fault("geometry_double_backward")
+def constant_geometry_gradient(patch):
+    """The gradient by the Laplacian is right once, but not differentiable again."""
+    original = linear_map._Solve.backward
+
+    def backward(ctx, grad):
+        *nothing, K_bar, b_bar = original(ctx, grad)
+        return (*nothing, K_bar.detach(), b_bar)
+
+    patch.setattr(linear_map._Solve, "backward", staticmethod(backward))
 
 
 @fault("geometry_gradient")
@@ -335,30 +370,35 @@ def constant_gauge(patch):
     )
 
 
-@fault("geometry_changes_no_value")
-def handles_missing_in_the_residual(patch):
-    """The refinement forgets the handles, and drifts away from them."""
-    wrap_method(patch, Solver, "_residual", lambda f, self, *args: f(self, *args[:-1], None))
+def change_right_hand_side(patch, change):
+    """Change (geometry, weights, R, images of pins, pull of handles)."""
+
+    def right_hand_side(original, self, *args):
+        return original(self, *change(self, *args))
+
+    wrap_method(patch, Solver, "_right_hand_side", right_hand_side)
 
 
 @fault("geometry_changes_no_value")
-def face_weights_missing_in_the_residual(patch):
-    """The refinement weighs faces by area alone."""
+def handles_do_not_pull_a_moving_mesh(patch):
+    """The right-hand side for a moving geometry has no handles."""
+    change_right_hand_side(patch, lambda self, *args: (*args[:-1], None))
 
-    def residual(original, self, geometry, weights, *rest):
-        return original(self, geometry, torch.ones_like(geometry.measures), *rest)
 
-    wrap_method(patch, Solver, "_residual", residual)
+@fault("geometry_changes_no_value")
+def pins_do_not_pull_a_moving_mesh(patch):
+    """The right-hand side for a moving geometry has no pins."""
+    change_right_hand_side(patch, lambda self, *args: (*args[:3], None, args[4]))
 
 
 @fault("geometry_gradient")
 def constant_face_weights(patch):
-    """Face weights are taken as constants."""
+    """Face weights are taken as constants in the right-hand side."""
 
-    def residual(original, self, geometry, weights, *rest):
-        return original(self, geometry, None, *rest)
+    def change(self, geometry, weights, *rest):
+        return geometry, self.constraints.face_weights, *rest
 
-    wrap_method(patch, Solver, "_residual", residual)
+    change_right_hand_side(patch, change)
 
 
 # ------------------------------------------------------- tetrahedra and their distortion

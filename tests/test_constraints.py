@@ -364,10 +364,6 @@ def calls_table() -> dict[str, tuple[dict, str]]:
             good | {"transforms": torch.zeros(1, 3, 3).double()},
             f"expected transforms of shape (…, 32, 3, 3), {batch} (1, 3, 3)",
         ),
-        "negative order": (
-            good | {"vertices": moved - 1e-9, "order": -1},
-            "order must not be negative, got -1",
-        ),
         "other vertices": (
             good | {"vertices": moved},
             "vertices differ from those that were factorised; solve with solver.update(vertices)",

@@ -8,7 +8,7 @@ zero.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.linalg
@@ -99,7 +99,7 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         MeshError: Voronoi areas of tetrahedra.
     """
     require_mesh("lumped_mass", mesh)
-    if not isinstance(mass, str) or mass not in ("barycentric", "voronoi"):
+    if str(mass) not in get_args(Mass):
         raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures

@@ -44,6 +44,15 @@ def degenerate(corners: Corners) -> Bool[Tensor, "m"]:
     return size <= _DETERMINANT_ROUNDOFF[edges.shape[1]] * _norm(edges).prod(dim=1)
 
 
+def thinness(corners: Corners) -> Float[Tensor, "m"]:
+    """Least height of each cell over its longest edge: √3/2 for an equilateral triangle."""
+    d = corners.shape[1] - 1
+    edges = _norm(corners[:, None] - corners[:, :, None]).flatten(1)
+    facets = edges if d == 2 else _norm(_facet_normals(corners)) / 2
+    heights = d * measures(corners) / facets.amax(dim=1)
+    return heights / edges.amax(dim=1)
+
+
 def frames(corners: Corners) -> Float[Tensor, "m D d"]:
     """Orthonormal basis of each cell's tangent space, as columns.
 

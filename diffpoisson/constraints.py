@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import topology
+from diffpoisson.arguments import to_tensor
 from diffpoisson.mesh import Mesh, describe_indices
 
 Gauge = Literal["mean", "vertex"]
@@ -144,7 +145,7 @@ def _vertex_indices(mesh: Mesh, name: str, indices: Tensor | None) -> Int[Tensor
     """Distinct vertex indices on the mesh's device, from indices or a mask over the vertices."""
     if indices is None:
         return torch.zeros(0, dtype=torch.int64, device=mesh.device)
-    indices = torch.as_tensor(indices, device=mesh.device)
+    indices = to_tensor("PoissonSolver", name, indices, mesh.device)
     if indices.dtype == torch.bool and indices.shape == (mesh.n_vertices,):
         return indices.nonzero()[:, 0]
     if indices.ndim != 1 or indices.dtype not in (torch.int32, torch.int64):
@@ -179,7 +180,7 @@ def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Te
 
 def _constant(name: str, values: Tensor | float, mesh: Mesh) -> Tensor:
     """A float64 copy, of what has no derivative."""
-    values = torch.as_tensor(values, device=mesh.device)
+    values = to_tensor("PoissonSolver", name, values, mesh.device)
     if values.requires_grad:
         _fail(
             f"{name} require grad, but a factor is constant, so their gradient would silently be "
@@ -223,7 +224,8 @@ def _labels(mesh: Mesh, weights: Tensor, pins: Tensor) -> Int[Tensor, "n"]:
 def _gauge_mask(
     mesh: Mesh, gauge: Gauge | Tensor, floating: Tensor, n_floating: int
 ) -> Bool[Tensor, "n"] | None:
-    if isinstance(gauge, Tensor):
+    if not isinstance(gauge, str):
+        gauge = to_tensor("PoissonSolver", "a gauge mask", gauge, mesh.device)
         if gauge.shape != (mesh.n_vertices,) or gauge.dtype != torch.bool:
             _fail(
                 f"a gauge mask must be (n={mesh.n_vertices},) bool, got {tuple(gauge.shape)} "

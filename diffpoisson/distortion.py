@@ -22,6 +22,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_number, require_single_or_double, require_tensor
+
 Jacobian = Float[Tensor, "*batch c d"]
 Density = Float[Tensor, "*batch"]
 
@@ -36,7 +38,11 @@ def singular_values(J: Jacobian) -> Float[Tensor, "*batch d"]:
         ValueError: J is not (…, 2, 2), (…, 3, 2) or (…, 3, 3).
     """
     if _shape(J) == (3, 3):
-        magnitudes = torch.linalg.svdvals(J)
+        require_single_or_double("singular_values", "J", J)
+        # LAPACK refuses the whole batch for one NaN.
+        finite = J.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+        magnitudes = torch.linalg.svdvals(torch.where(finite, J, 0))
+        magnitudes = torch.where(finite[..., 0], magnitudes, torch.nan)
         sign = torch.where(determinant(J) < 0, -1, 1).to(J)
         return torch.cat([magnitudes[..., :2], sign[..., None] * magnitudes[..., 2:]], dim=-1)
     total, difference = _sum_and_difference(J)
@@ -55,8 +61,8 @@ def determinant(J: Jacobian) -> Density:
 
 
 def flipped(J: Jacobian) -> Bool[Tensor, "*batch"]:
-    """Whether each cell is flipped or collapsed, det J ≤ 0 (the paper's #I counts them)."""
-    return determinant(J) <= 0
+    """Whether each cell is flipped or collapsed, det J ≤ 0 (the paper's #I counts them), or NaN."""
+    return ~(determinant(J) > 0)
 
 
 def isometric_distortion(J: Jacobian) -> Density:
@@ -139,6 +145,7 @@ def isometric_amips(
 
 def _shape(J: Tensor) -> tuple[int, int]:
     """(c, d), one of the three supported."""
+    require_tensor("distortion", "J", J)
     shape = (J.shape[-2], J.shape[-1]) if J.ndim >= 2 else (0, 0)
     if shape not in ((2, 2), (3, 2), (3, 3)):
         raise ValueError(
@@ -193,16 +200,22 @@ def _sqrt(x: Tensor) -> Tensor:
 
 def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:
     """χ(det J); for ε = 0 det J itself, and +∞ (a constant) where it is not positive."""
-    if epsilon < 0:
-        raise ValueError(f"distortion: epsilon must not be negative, got {epsilon}")
+    require_number("distortion", "epsilon", epsilon)
     det = determinant(J)
+    if epsilon > torch.finfo(J.dtype).max:
+        raise ValueError(f"distortion: epsilon = {epsilon} exceeds the range of {J.dtype}")
     if epsilon == 0:
         # Infinity keeps the denominators it ends up in, and their derivatives, free of 0/0.
         return torch.where(det > 0, det, torch.inf)
-    root = (det.square() + epsilon**2).sqrt()
+    root = torch.hypot(det, torch.full_like(det, epsilon))
     # For det < 0 the sum cancels; multiply by its conjugate instead.
     inverted = det < 0
-    return torch.where(inverted, epsilon**2 / torch.where(inverted, root - det, 1), root + det) / 2
+    return (
+        torch.where(
+            inverted, epsilon * (epsilon / torch.where(inverted, root - det, 1)), root + det
+        )
+        / 2
+    )
 
 
 def _guard(energy: Tensor, chi: Tensor) -> Tensor:

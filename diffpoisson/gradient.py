@@ -19,10 +19,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson import cells
+from diffpoisson.arguments import require_single_or_double, require_tensor
 from diffpoisson.linear_map import LinearMap, Matrix
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_cells, require_mesh
 from diffpoisson.restriction import extend, restrict
-from diffpoisson.transforms import constant_property, outside_transforms
+from diffpoisson.transforms import concrete, constant_property, outside_transforms
 
 
 class SparseMatrix(Matrix):
@@ -124,7 +125,8 @@ def jacobians(
         mesh: the domain.
         phi: (…, n, c) float32 or float64 image of each vertex, c output coordinates.
         extrinsic: return J Bᵀ, acting on ambient vectors (zero along the normal), instead of J.
-        vertices: (n, D) positions to use instead of the mesh's, to differentiate by.
+        vertices: (n, D) positions to use instead of the mesh's, to differentiate by. (Under vmap
+            and torch.compile they are not checked, and flat cells give infinities or NaN.)
 
     Returns:
         (…, m, c, d) in the coordinates of the faces' frames, d = 2 for triangles and 3 for
@@ -132,8 +134,11 @@ def jacobians(
         direction. Dimensionless if the image has the mesh's units. In the dtype of phi.
 
     Raises:
-        ValueError: phi does not have one row per vertex.
+        ValueError: phi does not have one row per vertex, or is on another device.
+        TypeError: phi is not a float32 or float64 tensor.
+        MeshError: a cell is flat at the given positions.
     """
+    _require("jacobians", mesh, "phi", phi, vertices)
     if phi.ndim < 2 or phi.shape[-2] != mesh.n_vertices:
         raise ValueError(
             f"jacobians: expected phi of shape (…, n={mesh.n_vertices}, c), got {tuple(phi.shape)}"
@@ -164,8 +169,11 @@ def divergence(
             stays what it is in the coordinates of the moving frames.
 
     Raises:
-        ValueError: R does not have one such matrix per face.
+        ValueError: R does not have one such matrix per face, or is on another device.
+        TypeError: R is not a float32 or float64 tensor.
+        MeshError: a cell is flat at the given positions.
     """
+    _require("divergence", mesh, "R", R, vertices)
     if vertices is not None:
         geometry = CellGeometry.at(mesh, vertices)
         intrinsic = as_intrinsic("divergence", mesh, R.double(), geometry.frames)
@@ -177,7 +185,23 @@ def divergence(
 
 def laplacian(mesh: Mesh) -> sp.csr_matrix:
     """The cotangent Laplacian L = ∇ᵀA∇, (n, n), symmetric positive semi-definite, float64."""
+    require_mesh("laplacian", mesh)
     return gradient_operator(mesh).laplacian.copy()
+
+
+def _require(operation: str, mesh: Mesh, name: str, field: Tensor, vertices: Tensor | None) -> None:
+    require_mesh(operation, mesh)
+    require_tensor(operation, name, field, mesh.device)
+    require_single_or_double(operation, name, field)
+    if vertices is not None:
+        require_tensor(operation, "vertices", vertices, mesh.device)
+        require_single_or_double(operation, "vertices", vertices)
+        if vertices.shape != mesh.vertices.shape:
+            raise ValueError(
+                f"{operation}: expected vertices of shape {tuple(mesh.vertices.shape)}, "
+                f"got {tuple(vertices.shape)}"
+            )
+        require_cells(operation, concrete(vertices), mesh.faces)
 
 
 def as_intrinsic(
@@ -212,11 +236,6 @@ class CellGeometry(NamedTuple):
     @classmethod
     def at(cls, mesh: Mesh, vertices: Float[Tensor, "n D"]) -> CellGeometry:
         """The geometry of a mesh's cells at other positions, in float64."""
-        if vertices.shape != mesh.vertices.shape:
-            raise ValueError(
-                f"expected vertices of shape {tuple(mesh.vertices.shape)}, "
-                f"got {tuple(vertices.shape)}"
-            )
         corners = vertices.double()[mesh.faces]
         frames = cells.frames(corners)
         hats = cells.hat_gradients(corners, frames)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells, topology
+from diffpoisson.arguments import as_tensor, require_instances, require_integer, require_tensor
 from diffpoisson.transforms import constant_property, is_transformed, outside_transforms
 
 ArrayLike = Tensor | np.ndarray
@@ -142,6 +143,7 @@ class Mesh:
         Raises:
             MeshError: as for a new mesh, or another shape, dtype or device than before.
         """
+        require_tensor("Mesh.with_vertices", "vertices", vertices)
         before = (self.vertices.shape, self.dtype, self.device)
         if (vertices.shape, vertices.dtype, vertices.device) != before:
             raise MeshError(
@@ -158,6 +160,8 @@ class Mesh:
 
     def to(self, target: torch.dtype | torch.device | str) -> Mesh:
         """The same mesh in another floating dtype or on another device."""
+        if not isinstance(target, torch.dtype):
+            target = _as_device(target)
         moved = object.__new__(Mesh)
         faces = self.faces if isinstance(target, torch.dtype) else self.faces.to(target)
         vertices = self.vertices.to(target)
@@ -330,6 +334,7 @@ class Mesh:
         Parts keep their order: `split_vertices` and `split_faces` take per-vertex and per-face
         values of the union apart again.
         """
+        require_instances("Mesh.concatenate", meshes, Mesh)
         if not meshes:
             raise MeshError("Mesh.concatenate: needs at least one mesh")
         kinds = sorted({f"D={m.dim} d={m.cell_dim} {m.dtype} {m.device}" for m in meshes})
@@ -364,11 +369,11 @@ class Mesh:
 
     def split_vertices(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
         """Per-vertex values of a concatenated mesh, cut along `dim` into one tensor per part."""
-        return values.split(np.diff(self.vertex_offsets).tolist(), dim)
+        return _split("Mesh.split_vertices", values, self.vertex_offsets, dim)
 
     def split_faces(self, values: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
         """Per-face values of a concatenated mesh, cut along `dim` into one tensor per part."""
-        return values.split(np.diff(self.face_offsets).tolist(), dim)
+        return _split("Mesh.split_faces", values, self.face_offsets, dim)
 
     # ---------------------------------------------------------------- repair
 
@@ -414,9 +419,32 @@ class Mesh:
 # -------------------------------------------------------------------- validation
 
 
+def require_mesh(operation: str, mesh: object) -> None:
+    """Raise TypeError for anything but a `Mesh`, such as another library's."""
+    if not isinstance(mesh, Mesh):
+        raise TypeError(
+            f"{operation}: expected a diffpoisson.Mesh, got {type(mesh).__name__}; build one with "
+            "Mesh(vertices, faces)"
+        )
+
+
+def require_cells(operation: str, vertices: Tensor | None, faces: Tensor) -> None:
+    """Raise MeshError where positions, if known, leave cells without area or volume."""
+    if vertices is None:
+        return
+    corners = vertices.double()[faces]
+    flat = cells.degenerate(corners) | ~corners.flatten(1).isfinite().all(dim=1)
+    if flat.any():
+        culprits = describe_indices(flat.nonzero()[:, 0], "face", "faces")
+        raise MeshError(
+            f"{operation}: at the given vertices, {culprits} not finite or of zero "
+            f"{_measure(faces)}"
+        )
+
+
 def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     try:
-        vertices, faces = _as_tensor(vertices), _as_tensor(faces)
+        vertices, faces = as_tensor(vertices), as_tensor(faces)
     except (TypeError, ValueError, RuntimeError) as error:
         raise MeshError(
             f"Mesh: vertices and faces must be tensors or numeric arrays: {error}"
@@ -428,9 +456,13 @@ def _as_tensors(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     return vertices, faces.long() if _is_integer(faces) else faces
 
 
-def _as_tensor(values: ArrayLike) -> Tensor:
-    # torch cannot share arrays that are read-only or have negative strides, such as faces[:, ::-1].
-    return torch.as_tensor(values.copy() if isinstance(values, np.ndarray) else values)
+def _as_device(target: object) -> torch.device:
+    if not isinstance(target, (str, torch.device)):
+        raise TypeError(f"Mesh.to: expected a dtype or a device, got {type(target).__name__}")
+    try:
+        return torch.device(target)
+    except RuntimeError as error:
+        raise ValueError(f"Mesh.to: {target!r} is no device: {error}") from error
 
 
 def _is_integer(values: Tensor) -> bool:
@@ -448,6 +480,12 @@ def _require_constant(vertices: ArrayLike) -> None:
 
 def _check_arrays(vertices: Tensor, faces: Tensor) -> None:
     """Shapes and dtypes: what even `Mesh.cleaned` cannot repair."""
+    for name, values in (("vertices", vertices), ("faces", faces)):
+        if values.layout != torch.strided or values.is_meta:
+            raise MeshError(
+                f"Mesh: {name} must be a dense tensor with values, got {values.layout} on "
+                f"{values.device}"
+            )
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3):
         raise MeshError(f"Mesh: vertices must be (n, 2) or (n, 3), got {tuple(vertices.shape)}")
     if vertices.dtype not in (torch.float32, torch.float64):
@@ -527,6 +565,21 @@ def _repeated(faces: Int[Tensor, "m k"]) -> Bool[Tensor, "m"]:
 
 
 # -------------------------------------------------------------------- indices
+
+
+def _split(
+    operation: str, values: object, offsets: tuple[int, ...], dim: int
+) -> tuple[Tensor, ...]:
+    if not isinstance(values, Tensor) or values.layout != torch.strided:
+        raise TypeError(
+            f"{operation}: values must be a dense torch tensor, got {type(values).__name__}"
+        )
+    require_integer(operation, "dim", dim)
+    if not -values.ndim <= dim < values.ndim or values.shape[dim] != offsets[-1]:
+        raise ValueError(
+            f"{operation}: expected {offsets[-1]} values along dim {dim}, got {tuple(values.shape)}"
+        )
+    return values.split(np.diff(offsets).tolist(), dim)
 
 
 def _concatenate_offsets(parts: Sequence[tuple[int, ...]]) -> tuple[int, ...]:

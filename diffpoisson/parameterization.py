@@ -19,10 +19,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import (
+    require_integer,
+    require_number,
+    require_single_or_double,
+    require_tensor,
+)
 from diffpoisson.distortion import flipped, symmetric_dirichlet
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import jacobians, laplacian
-from diffpoisson.mesh import Mesh, MeshError
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
 
 
 class SlimResult(NamedTuple):
@@ -104,6 +110,16 @@ def slim(
     import igl  # noqa: PLC0415  (a heavy import that only flattening needs)
 
     _require_disk("slim", mesh)
+    require_number("slim", "tolerance", tolerance)
+    require_integer("slim", "max_iterations", max_iterations, least=0)
+    require_tensor("slim", "init", init, mesh.device)
+    require_single_or_double("slim", "init", init)
+    if init.requires_grad:
+        raise ValueError("slim: init requires grad, but SLIM is not differentiable; detach it")
+    if init.shape != (mesh.n_vertices, 2):
+        raise ValueError(
+            f"slim: expected init of shape (n={mesh.n_vertices}, 2), got {tuple(init.shape)}"
+        )
     energies = [_mean_energy(mesh, init)]
     if not math.isfinite(energies[0]):
         count = int(flipped(jacobians(mesh, init)).sum())
@@ -151,6 +167,17 @@ def procrustes(
         weights: (n,) non-negative, e.g. `mesh.vertex_areas`.
         reflect: allow a reflection where that fits better; otherwise only rotations.
     """
+    for name, value in (("source", source), ("target", target), ("weights", weights)):
+        require_tensor("procrustes", name, value, source.device if name != "source" else None)
+    shapes = [tuple(value.shape) for value in (source, target, weights)]
+    points = [shape[-2:] for shape in shapes[:2]]
+    if weights.ndim != 1 or points != [(len(weights), 2)] * 2:
+        raise ValueError(
+            "procrustes: expected source and target of shape (…, n, 2) and weights (n,), got "
+            f"{shapes[0]}, {shapes[1]} and {shapes[2]}"
+        )
+    if not (weights >= 0).all() or not 0 < weights.sum() < math.inf:
+        raise ValueError("procrustes: weights must be finite and not negative, nor all zero")
     w = (weights / weights.sum())[:, None]
     target_mean = (w * target).sum(dim=-2, keepdim=True)
     source = source - (w * source).sum(dim=-2, keepdim=True)
@@ -222,6 +249,9 @@ def _fortran(values: Tensor) -> np.ndarray:
 
 
 def _require_disk(operation: str, mesh: Mesh) -> None:
+    require_mesh(operation, mesh)
+    if mesh.cell_dim != 2:
+        raise MeshError(f"{operation}: flattens surfaces, got tetrahedra")
     if mesh.dim != 3:
         raise MeshError(
             f"{operation}: flattens surfaces in space, got vertices with D = {mesh.dim}"

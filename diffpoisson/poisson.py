@@ -24,6 +24,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from diffpoisson import cells
+from diffpoisson.arguments import require_instances, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -36,7 +38,7 @@ from diffpoisson.gradient import (
     vertices_to_columns,
 )
 from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.transforms import outside_transforms, require_equal
 
 
@@ -63,6 +65,7 @@ class PoissonSolver:
         ValueError: indices out of range, named twice, or both pinned and handles; every vertex
             pinned; weights that are negative, not finite, or that require grad; a vertex that only
             faces of weight zero touch; a gauge mask that misses a component.
+        MeshError: faces so thin that rounding makes the Laplacian indefinite.
     """
 
     def __init__(
@@ -75,6 +78,7 @@ class PoissonSolver:
         handle_weights: Float[Tensor, "h"] | float = 1.0,
         face_weights: Float[Tensor, "m"] | None = None,
     ) -> None:
+        require_mesh("PoissonSolver", mesh)
         with outside_transforms():
             constraints = Constraints.build(
                 mesh,
@@ -86,7 +90,7 @@ class PoissonSolver:
             )
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
-            factor = CholeskyFactor(L[free][:, free], mesh.device)
+            factor = _factorised(L[free][:, free], mesh)
             self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
 
     def _assign(
@@ -145,6 +149,7 @@ class PoissonSolver:
             ValueError: some solvers have the gauge "vertex" and others do not.
             MeshError: the meshes differ in dimension, dtype or device.
         """
+        require_instances("PoissonSolver.concatenate", solvers, PoissonSolver)
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
         union = object.__new__(cls)
@@ -188,13 +193,17 @@ class PoissonSolver:
         Raises:
             ValueError: shapes that do not fit; images missing for pins or handles, or given
                 without; `vertices` or `face_weights` that differ from those that were factorised.
+            TypeError: what should be a tensor is none, or not of floating dtype.
         """
+        require_tensor("PoissonSolver", "R", R, self.mesh.device)
         geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
         batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
         if transforms is not None:
-            _require_shape("transforms", transforms, batch, (self.mesh.n_faces, c, c))
+            _require_shape(
+                "transforms", transforms, batch, (self.mesh.n_faces, c, c), self.mesh.device
+            )
             intrinsic = transforms.double() @ intrinsic
         constraints = self.constraints
         q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
@@ -227,6 +236,7 @@ class PoissonSolver:
             b: (n, k) right-hand sides; over each floating component they must sum to zero, or no
                 solution exists. The rows of anchors and pins are not read.
         """
+        require_tensor("solve_laplacian", "b", b, self.mesh.device)
         if b.ndim != 2 or len(b) != self.mesh.n_vertices:
             raise ValueError(
                 f"solve_laplacian: expected b of shape (n={self.mesh.n_vertices}, k), "
@@ -248,7 +258,7 @@ class PoissonSolver:
     def _columns(
         self, name: str, values: Tensor, count: int, batch: torch.Size, c: int
     ) -> Float[Tensor, "count k"]:
-        _require_shape(name, values, batch, (count, c))
+        _require_shape(name, values, batch, (count, c), self.mesh.device)
         return vertices_to_columns(values.double().expand(*batch, count, c))
 
     def _scattered(
@@ -272,9 +282,11 @@ class PoissonSolver:
         shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
         if means is not None:
             shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
+        shifts = shifts[:-1]
         if translations is not None:
-            q = self._columns("translations", translations, self.n_floating, batch, c)
-            shifts = torch.cat([shifts[:-1] + q, shifts[-1:]])
+            shifts = shifts + self._columns("translations", translations, self.n_floating, batch, c)
+        # What is held stays where it is, and catches no NaN, times zero, from other components.
+        shifts = torch.cat([shifts, shifts.new_zeros(1, shifts.shape[1])])
         return phi + shifts.index_select(0, constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
@@ -289,6 +301,7 @@ class PoissonSolver:
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
+                require_tensor("PoissonSolver", name, yours, self.mesh.device)
                 require_equal(
                     yours.double(),
                     mine.double(),
@@ -339,8 +352,25 @@ def solve_poisson(mesh: Mesh, R: Float[Tensor, "*batch m c k"], **options: Any) 
     return PoissonSolver(mesh, **options)(R, **images)
 
 
-def _require_shape(name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...]) -> None:
+def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
+    """The factor of what is positive definite but for rounding."""
+    try:
+        return CholeskyFactor(L, mesh.device)
+    except ValueError as error:
+        thinness = cells.thinness(mesh._corners)
+        worst = int(thinness.argmin())
+        raise MeshError(
+            "PoissonSolver: in float64 the Laplacian of this mesh is not positive definite; its "
+            f"thinnest face, {worst}, has a height of {float(thinness[worst]):.0e} of its longest "
+            f"edge: remesh such faces, or bring weights closer together ({error})"
+        ) from error
+
+
+def _require_shape(
+    name: str, values: Tensor, batch: torch.Size, shape: tuple[int, ...], device: torch.device
+) -> None:
     """Raise unless values are (*batch, *shape), or have batch dimensions that broadcast to it."""
+    require_tensor("PoissonSolver", name, values, device)
     given = values.shape[: -len(shape)]
     broadcast = zip(reversed(given), reversed(batch), strict=False)
     if (

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_tensor
+
 
 def restrict(
     P: Float[Tensor, "*batch m c D"], frames: Float[Tensor, "m D d"]
@@ -18,8 +20,9 @@ def restrict(
 
     Raises:
         ValueError: the shapes do not fit.
+        TypeError: not tensors of floating dtype.
     """
-    _check("restrict", P, frames, "D", frames.shape[1])
+    _check("restrict", P, frames, "D", 1)
     return _product(P, frames)
 
 
@@ -36,8 +39,9 @@ def extend(
 
     Raises:
         ValueError: the shapes do not fit.
+        TypeError: not tensors of floating dtype.
     """
-    _check("extend", R, frames, "d", frames.shape[2])
+    _check("extend", R, frames, "d", 2)
     return _product(R, frames.mT)
 
 
@@ -47,8 +51,14 @@ def _product(matrices: Tensor, frames: Tensor) -> Tensor:
         return matrices @ frames.to(matrices.dtype)
 
 
-def _check(operation: str, matrices: Tensor, frames: Tensor, name: str, columns: int) -> None:
-    m = len(frames)
+def _check(operation: str, matrices: Tensor, frames: Tensor, name: str, axis: int) -> None:
+    require_tensor(operation, "frames", frames)
+    if frames.ndim != 3:
+        raise ValueError(
+            f"{operation}: expected frames of shape (m, D, d), got {tuple(frames.shape)}"
+        )
+    require_tensor(operation, "matrices", matrices, frames.device)
+    m, columns = len(frames), frames.shape[axis]
     if matrices.ndim < 3 or matrices.shape[-3] != m or matrices.shape[-1] != columns:
         raise ValueError(
             f"{operation}: with frames of shape {tuple(frames.shape)} expected matrices of shape "

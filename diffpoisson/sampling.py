@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffpoisson.mesh import Mesh
+from diffpoisson.arguments import require_integer, require_tensor
+from diffpoisson.mesh import Mesh, require_mesh
 
 
 class SurfaceSamples(NamedTuple):
@@ -26,7 +27,9 @@ class SurfaceSamples(NamedTuple):
         self, mesh: Mesh, values: Float[Tensor, "*batch n c"]
     ) -> Float[Tensor, "*batch s c"]:
         """Vertex values at the points, linear on each face; differentiable in `values`."""
-        if values.shape[-2] != mesh.n_vertices:
+        require_mesh("interpolate", mesh)
+        require_tensor("interpolate", "values", values, mesh.device)
+        if values.ndim < 2 or values.shape[-2] != mesh.n_vertices:
             raise ValueError(
                 f"interpolate: expected values of shape (…, n={mesh.n_vertices}, c), "
                 f"got {tuple(values.shape)}"
@@ -48,8 +51,8 @@ def sample_surface(
     Raises:
         ValueError: n_samples is negative.
     """
-    if n_samples < 0:
-        raise ValueError(f"sample_surface: n_samples must not be negative, got {n_samples}")
+    require_mesh("sample_surface", mesh)
+    require_integer("sample_surface", "n_samples", n_samples, least=0)
 
     def uniform() -> Tensor:
         like = mesh.areas.new_empty(n_samples, dtype=torch.float64)

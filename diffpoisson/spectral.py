@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_integer, to_tensor
 from diffpoisson.gradient import laplacian
-from diffpoisson.mesh import Mesh, MeshError
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.poisson import PoissonSolver
 
 Mass = Literal["barycentric", "voronoi"]
@@ -49,9 +50,11 @@ def laplacian_eigenpairs(
         the dtype of the mesh.
 
     Raises:
-        MeshError: the mesh has fewer than k vertices.
+        MeshError: the mesh has fewer than k vertices, or too thin faces.
         ValueError: the solver is another mesh's, or has pins, handles or face weights.
     """
+    require_mesh("laplacian_eigenpairs", mesh)
+    require_integer("laplacian_eigenpairs", "n_eigenpairs", n_eigenpairs)
     n, zeros = mesh.n_vertices, mesh.n_components
     if not 1 <= n_eigenpairs <= n:
         raise MeshError(
@@ -65,6 +68,9 @@ def laplacian_eigenpairs(
             "not the Laplacian; pass one without"
         )
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
+    # Of total one, so that no scale is too large or small for ARPACK's tolerances.
+    total = areas.sum()
+    areas = areas / total
     wanted = n_eigenpairs - zeros
     # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.
     if wanted > 0 and 2 * wanted + 1 < n - zeros:
@@ -74,8 +80,14 @@ def laplacian_eigenpairs(
         L = laplacian(mesh).toarray()
         pairs = scipy.linalg.eigh(L, np.diag(areas))
         pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
+        if (pairs[0] <= 0).any():
+            raise MeshError(
+                "laplacian_eigenpairs: rounding hides the smallest eigenvalues behind the largest, "
+                "that of the thinnest faces; remesh these"
+            )
     values = np.concatenate([np.zeros(zeros), pairs[0]])[:n_eigenpairs]
     vectors = np.concatenate([_constants(mesh, areas), pairs[1]], axis=1)[:, :n_eigenpairs]
+    values, vectors = values / total, vectors / np.sqrt(total)
     return torch.from_numpy(values).to(mesh.vertices), torch.from_numpy(vectors).to(mesh.vertices)
 
 
@@ -86,6 +98,7 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         ValueError: unknown kind of mass.
         MeshError: Voronoi areas of tetrahedra.
     """
+    require_mesh("lumped_mass", mesh)
     if mass == "barycentric":
         return mesh.vertex_measures
     if mass != "voronoi":
@@ -124,6 +137,7 @@ def wave_kernel_signature(
     Raises:
         MeshError: too few vertices, or no two different non-zero eigenvalues, for this spectrum.
     """
+    require_integer("wave_kernel_signature", "n_energies", n_energies, least=1)
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
     log_values = values[mesh.n_components :].double().log()
     if len(log_values) < 2 or log_values[0] == log_values[-1]:
@@ -155,11 +169,21 @@ def heat_kernel_signature(
 
     Args:
         mesh: the surface.
-        times: (t,) diffusion times, in units².
+        times: (t,) diffusion times, in units², not negative.
         n_eigenpairs: size of the truncated spectrum, counting the zero eigenvalues.
         mass: see `laplacian_eigenpairs`.
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+
+    Raises:
+        ValueError: negative times.
     """
+    require_mesh("heat_kernel_signature", mesh)
+    times = to_tensor("heat_kernel_signature", "times", times, mesh.device).to(mesh.dtype)
+    if times.ndim != 1 or not ((times >= 0) & times.isfinite()).all():
+        raise ValueError(
+            "heat_kernel_signature: times must be (t,), finite and not negative, got shape "
+            f"{tuple(times.shape)}"
+        )
     values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
     return vectors**2 @ torch.exp(-values[:, None] * times.to(values)[None])
 

@@ -59,6 +59,17 @@ def is_transformed(value: Tensor) -> bool:
     return bool(torch._C._functorch.is_functorch_wrapped_tensor(value))
 
 
+def concrete(value: Tensor) -> Tensor | None:
+    """The values of a tensor under whatever transforms; None while compiling, or under vmap."""
+    if torch.compiler.is_compiling():
+        return None
+    while is_transformed(value):
+        if torch._C._functorch.is_batchedtensor(value):
+            return None
+        value = torch._C._functorch.get_unwrapped(value)
+    return value.detach()
+
+
 def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
     """Raise unless a tensor, under whatever transforms, has the expected values.
 
@@ -69,9 +80,8 @@ def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
     if torch.compiler.is_compiling():
         torch._assert_async((value.detach() == expected).all(), message)
         return
-    while is_transformed(value):
-        if torch._C._functorch.is_batchedtensor(value):
-            raise ValueError(f"{message} (vmap gives one for each element of the batch)")
-        value = torch._C._functorch.get_unwrapped(value)
-    if not torch.equal(value.detach(), expected):
+    known = concrete(value)
+    if known is None:
+        raise ValueError(f"{message} (vmap gives one for each element of the batch)")
+    if not torch.equal(known, expected):
         raise ValueError(message)

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import platform
 import time
+import warnings
 from collections.abc import Iterable
 from dataclasses import asdict
 from itertools import chain, islice
@@ -43,6 +45,8 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     options = parse(argv)
     options.out.mkdir(parents=True, exist_ok=True)
     lightning.seed_everything(options.seed, verbose=False)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
+    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
 
     patches, counts = collect_patches(options)
     train, validation, test = split_by_mesh(patches, SPLIT, seed=options.seed)

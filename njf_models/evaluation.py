@@ -59,6 +59,7 @@ def evaluate_uv(
     model: NeuralJacobianField, examples: UVExamples
 ) -> tuple[list[UVRecord], list[Float[Tensor, "n 2"]]]:
     """Map each patch on its own: the records, and the maps."""
+    was_training = model.training
     model.eval()
     records, maps = [], []
     for index in range(len(examples)):
@@ -68,6 +69,7 @@ def evaluate_uv(
         milliseconds = 1000 * (time.perf_counter() - start)
         records.append(_record(examples.patches[index], batch, prediction, milliseconds))
         maps.append(prediction.vertices[0])
+    model.train(was_training)
     return records, maps
 
 

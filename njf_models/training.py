@@ -194,7 +194,8 @@ def make_trainer(
         save_on_exception=True,
         enable_version_counter=False,
     )
-    callbacks: list[Callback] = [checkpoints, TQDMProgressBar(), LearningRateMonitor()]
+    rate = LearningRateMonitor(logging_interval="epoch")
+    callbacks: list[Callback] = [checkpoints, TQDMProgressBar(), rate]
     if stop_after is not None:
         callbacks.append(EarlyStopping("validation/loss", patience=stop_after))
     return lightning.Trainer(
@@ -203,6 +204,7 @@ def make_trainer(
         max_time=None if minutes is None else timedelta(minutes=minutes),
         callbacks=callbacks,
         logger=[CSVLogger(folder, name="csv"), TensorBoardLogger(folder, name="tensorboard")],
+        log_every_n_steps=1,
         num_sanity_val_steps=0,
         enable_model_summary=False,
     )

@@ -313,7 +313,7 @@ def test_regularised_determinant_does_not_cancel():
 
 def test_negative_epsilon_raises(unchecked):
     for name in BARRIERS:
-        with pytest.raises(ValueError, match="epsilon must not be negative, got -1"):
+        with pytest.raises(ValueError, match="epsilon must be finite and not negative, got -1"):
             getattr(dp, name)(torch.eye(2), -1.0)
 
 

@@ -165,7 +165,7 @@ def test_double_precision_values_on_a_single_precision_mesh():
 def test_half_precision_raises(unchecked):
     mesh = dp.Mesh(*meshes.disk())
     for dtype in (torch.float16, torch.bfloat16):
-        with pytest.raises(TypeError, match="work in float32 and float64, got torch"):
+        with pytest.raises(TypeError, match="phi must be float32 or float64, got torch"):
             dp.jacobians(mesh, torch.zeros(25, 3, dtype=dtype))
 
 

@@ -116,7 +116,7 @@ def test_no_samples_and_wrong_input(unchecked):
     none = dp.sample_surface(mesh, 0)
     assert none.faces.shape == (0,)
     assert none.barycentric.shape == (0, 3)
-    with pytest.raises(ValueError, match="n_samples must not be negative, got -1"):
+    with pytest.raises(ValueError, match="n_samples must be at least 0, got -1"):
         dp.sample_surface(mesh, -1)
     message = "interpolate: expected values of shape (…, n=25, c), got (24, 3)"
     with pytest.raises(ValueError, match=re.escape(message)):

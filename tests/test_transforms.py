@@ -9,6 +9,7 @@ Where nothing right can be returned, something must be raised: the second half l
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from torch.utils.checkpoint import checkpoint
 
 import diffpoisson as dp
 from diffpoisson.factor import CholeskyFactor
+from diffpoisson.gradient import CellGeometry
 from tests import meshes, references
 from tests.checks import assert_near, field, normal
 
@@ -532,3 +534,277 @@ def test_grid(apply, build, dtype, device):
 @devices
 def test_grid_of_batches(apply, name, dtype, device):
     agree(LAYERS[name], apply, dtype, device)
+
+
+# ------------------------------------------------------- cost: one factor call per pass
+
+
+FACTOR_CALLS = {  # two losses have two solves of each order, all directions of one fold
+    "value": 1,
+    "vmap first": 1,
+    "vmap last": 1,
+    "vmap vmap": 1,
+    "vmap jvp": 2,
+    "vmap grad": 2,
+    "grad vmap": 2,
+    "backward": 2,
+    "checkpoint": 3,
+    "vjp": 2,
+    "jvp": 2,
+    "jacrev": 2,
+    "jacfwd": 2,
+}
+
+
+@pytest.mark.parametrize("name", FACTOR_CALLS)
+@pytest.mark.parametrize("layer", ["Poisson, surface", "geometry"])
+def test_factor_calls(name, layer, monkeypatch):
+    """All rows of a Jacobian, all elements of a batch: columns of one triangular solve."""
+    apply = (TRANSFORMS | FIELD_TRANSFORMS)[name]
+    if layer in GEOMETRY and name in FIELD_TRANSFORMS:
+        pytest.skip("no batch of vertices")
+    function, _, x = LAYERS[layer](torch.float64, "cpu")
+    calls = []
+    multiply = CholeskyFactor.multiply
+    monkeypatch.setattr(
+        CholeskyFactor, "multiply", lambda self, x: calls.append(x.shape) or multiply(self, x)
+    )
+    apply(function, x)
+    assert len(calls) == FACTOR_CALLS[name]
+
+
+# ------------------------------------------------------- autocast
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_autocast_does_not_round_geometry(name):
+    """Under bfloat16 autocast: the same numbers to float32, forward and backward."""
+    function, _, x = LAYERS[name](torch.float32, "cpu")
+    leaf = x.clone().requires_grad_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        value = function(leaf)
+        result = loss(lambda x: value)(leaf)
+    result.backward()
+    assert value.dtype == torch.float32
+    assert_near(value.detach(), function(x), 1e-6)
+    assert_near(leaf.grad, grad(loss(function))(x), 1e-5)
+
+
+# ------------------------------------------------------- torch.compile
+
+
+COMPILED: dict[str, Callable[[Callable, Function, Tensor], Tensor]] = {}
+
+
+def compiled(function: Callable) -> Callable:
+    COMPILED[function.__name__.removeprefix("compiled_").replace("_", " ")] = function
+    return function
+
+
+@compiled
+def compiled_forward(compile_, f, x):
+    return compile_(f)(x)
+
+
+@compiled
+def compiled_backward(compile_, f, x):
+    x = x.clone().requires_grad_()
+    compile_(loss(f))(x).backward()
+    return x.grad
+
+
+@compiled
+def compiled_grad(compile_, f, x):
+    return compile_(grad(loss(f)))(x)
+
+
+@compiled
+def compiled_jvp(compile_, f, x):
+    return compile_(lambda x, v: jvp(f, (x,), (v,))[1])(x, direction(x))
+
+
+@compiled
+def compiled_hessian_vector_product(compile_, f, x):
+    return compile_(lambda x, v: jvp(grad(loss(f)), (x,), (v,))[1])(x, direction(x))
+
+
+@pytest.fixture
+def compile_(unchecked, monkeypatch):
+    # Dynamo stumbles over shape checks, even disabled ones, on methods of objects made in a graph.
+    for name in ("gradient", "divergence", "stiffness", "vertex_measures"):
+        monkeypatch.setattr(CellGeometry, name, inspect.unwrap(getattr(CellGeometry, name)))
+    torch.compiler.reset()
+    yield lambda f, backend="aot_eager": torch.compile(f, fullgraph=True, backend=backend)
+    torch.compiler.reset()
+
+
+def as_it_is(f: Callable, backend: str = "") -> Callable:
+    return f
+
+
+COMPILED_LAYERS = ["jacobians", "divergence", "pins and handles", "concatenation", "geometry"]
+
+
+@pytest.mark.parametrize("apply", COMPILED.values(), ids=COMPILED)
+@pytest.mark.parametrize("name", COMPILED_LAYERS)
+@devices
+def test_compiled(apply, name, device, compile_):
+    function, reference, x = LAYERS[name](torch.float64, device)
+    function(x)  # assembles the mesh's operators
+    actual, expected = apply(compile_, function, x), apply(as_it_is, reference, x)
+    assert_near(actual.detach().cpu(), expected.detach().cpu(), RTOL[torch.float64])
+
+
+def test_compiled_vmap(compile_):
+    function, reference, x = LAYERS["pins and handles"](torch.float64, "cpu")
+    batch = batch_of(x, 0)
+    actual = compile_(vmap(grad(loss(function))))(batch)
+    assert_near(actual, vmap(grad(loss(reference)))(batch), RTOL[torch.float64])
+
+
+@pytest.mark.slow
+def test_compiled_by_inductor(compile_):
+    for name in ("pins and handles", "geometry"):
+        function, reference, x = LAYERS[name](torch.float64, "cpu")
+        actual = compiled_backward(functools.partial(compile_, backend="inductor"), function, x)
+        assert_near(actual, grad(loss(reference))(x), RTOL[torch.float64])
+
+
+def test_compiled_at_the_first_use_of_a_mesh(compile_):
+    """Tracing cannot assemble operators: it says so, and what to do, and after that it works."""
+    mesh = surface(torch.float64, "cpu")
+    function, phi = compile_(lambda phi: dp.jacobians(mesh, phi)), values(8, 2)
+    with pytest.raises(torch._dynamo.exc.Unsupported, match="operators of this mesh are not assem"):
+        function(phi)
+    dp.PoissonSolver(mesh)
+    torch.compiler.reset()
+    assert_near(function(phi), dp.jacobians(mesh, phi), 1e-12)
+
+
+# ------------------------------------------------------- what cannot be right raises
+
+
+def moving_solver() -> tuple[dp.PoissonSolver, Tensor, Tensor]:
+    mesh = surface(torch.float64, "cpu")
+    return dp.PoissonSolver(mesh), field(mesh, c=2), mesh.vertices
+
+
+def test_double_backward_through_compiled_code_raises(compile_):
+    """AOTAutograd does not support it: torch raises, and nothing here turns that into zeros."""
+    function, _, x = LAYERS["pins and handles"](torch.float64, "cpu")
+    x = x.clone().requires_grad_()
+    (g,) = torch.autograd.grad(compile_(loss(function))(x), x, create_graph=True)
+    with pytest.raises(RuntimeError, match="double backward"):
+        g.square().sum().backward()
+
+
+@pytest.mark.parametrize("batched", ["vertices", "face_weights"])
+def test_vmap_over_geometry_raises(batched):
+    """A factor is of one geometry."""
+    solver, R, v = moving_solver()
+    given = {"vertices": v, "face_weights": torch.ones(len(R)).double()}[batched]
+    with pytest.raises(ValueError, match="vmap gives one for each element of the batch"):
+        vmap(lambda x: solver(R, **{batched: x}))(given.expand(2, *given.shape))
+    with pytest.raises(ValueError, match="vmap gives one for each element of the batch"):
+        vmap(grad(lambda x: solver(R, **{batched: x}).sum()))(given.expand(2, *given.shape))
+
+
+def test_vmap_over_fields_with_moving_geometry():
+    """That batch is fine: one geometry, several fields."""
+    solver, R, v = moving_solver()
+    batch = torch.stack([R, R.cos()])
+    summed = lambda v, R: (solver(R, vertices=v) ** 3).sum()  # noqa: E731
+    expected = torch.stack([grad(summed)(v, R) for R in batch])
+    assert_near(vmap(grad(summed), (None, 0))(v, batch), expected, 1e-12)
+
+
+OTHER_VERTICES = {
+    "plain": lambda f, v: f(v),
+    "grad": lambda f, v: grad(lambda v: f(v).sum())(v),
+    "jvp": lambda f, v: jvp(f, (v,), (v,)),
+    "hessian": lambda f, v: hessian(lambda v: f(v).sum())(v),
+    "vmap over fields": lambda f, v: vmap(lambda s: f(v) * s)(torch.ones(2)),
+}
+
+
+@pytest.mark.parametrize("apply", OTHER_VERTICES.values(), ids=OTHER_VERTICES)
+def test_other_vertices_raise(apply):
+    solver, R, v = moving_solver()
+    with pytest.raises(ValueError, match="vertices differ from those that were factorised"):
+        apply(lambda v: solver(R, vertices=v), v + 1e-12)
+
+
+def test_other_vertices_raise_in_compiled_code(compile_):
+    """The code compiled for the solver's own positions checks them each time it runs."""
+    solver, R, v = moving_solver()
+    compiled = compile_(lambda v: solver(R, vertices=v))
+    assert_near(compiled(v), solver(R), 1e-12)
+    with pytest.raises(RuntimeError, match="vertices differ from those that were factorised"):
+        compiled(v + 1e-12)
+
+
+def test_vertices_edited_in_place_raise():
+    """A mesh is immutable; who edits its tensors all the same gets no mixture of two geometries."""
+    solver, R, v = moving_solver()
+    expected = solver(R)
+    v.mul_(2)
+    assert torch.equal(solver(R), expected)
+    with pytest.raises(ValueError, match="vertices differ from those that were factorised"):
+        solver(R, vertices=v)
+
+
+MESH_OF_MOVING_VERTICES = {
+    "requires grad": lambda f, v: f(v.clone().requires_grad_()),
+    "grad": lambda f, v: grad(f)(v),
+    "jvp": lambda f, v: jvp(f, (v,), (v,)),
+    "jacfwd": lambda f, v: jacfwd(f)(v),
+    "vmap": lambda f, v: vmap(f)(v[None]),
+}
+
+
+@pytest.mark.parametrize("apply", MESH_OF_MOVING_VERTICES.values(), ids=MESH_OF_MOVING_VERTICES)
+def test_a_mesh_of_moving_vertices_raises(apply):
+    """It would be a constant, and every derivative by its vertices silently zero."""
+    _, R, v = moving_solver()
+    faces = surface(torch.float64, "cpu").faces
+    with pytest.raises(dp.MeshError, match="vertices"):
+        apply(lambda v: dp.PoissonSolver(dp.Mesh(v, faces))(R).sum(), v)
+    solver = moving_solver()[0]
+    with pytest.raises(dp.MeshError, match="vertices"):
+        apply(lambda v: solver.update(v)(R).sum(), v)
+
+
+def test_a_mesh_of_dual_vertices_raises():
+    _, _, v = moving_solver()
+    faces = surface(torch.float64, "cpu").faces
+    with forward_ad.dual_level(), pytest.raises(dp.MeshError, match="vertices"):
+        dp.Mesh(forward_ad.make_dual(v, v), faces)
+
+
+def test_slim_of_a_moving_start_raises(unchecked):
+    """Its result would be a constant."""
+    mesh = mesh_of(meshes.disk(), torch.float64, "cpu")
+    init = dp.tutte(mesh)
+    for apply in (lambda f, x: f(x.clone().requires_grad_()), lambda f, x: jvp(f, (x,), (x,))):
+        with pytest.raises(ValueError, match="init"):
+            apply(lambda uv: dp.slim(mesh, uv).uv, init)
+
+
+def test_moving_constants_of_a_solver_raise():
+    """Handle and face weights given to the constructor are constants of the factor."""
+    mesh = surface(torch.float64, "cpu")
+    for name, count in (("face_weights", mesh.n_faces), ("handle_weights", 1)):
+        options = {"handles": torch.tensor([0])}
+
+        def build(w, name=name, options=options):
+            solver = dp.PoissonSolver(mesh, **options, **{name: w})
+            return solver(field(mesh, c=2), handles=values(1, 2)).sum()
+
+        w = torch.ones(count, dtype=torch.float64)
+        for apply in (
+            lambda f, w: f(w.clone().requires_grad_()),
+            lambda f, w: grad(f)(w),
+            lambda f, w: jvp(f, (w,), (w,)),
+        ):
+            with pytest.raises(ValueError, match=name):
+                apply(build, w)

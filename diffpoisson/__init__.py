@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from diffpoisson.certificate import Certificate, certify
 from diffpoisson.distortion import (
     arap,
     area_distortion,
@@ -18,6 +19,7 @@ from diffpoisson.gradient import divergence, jacobians, laplacian
 from diffpoisson.mesh import CleanedMesh, Mesh, MeshError
 from diffpoisson.parameterization import SlimResult, procrustes, slim, tutte
 from diffpoisson.poisson import PoissonSolver, solve_poisson
+from diffpoisson.repair import clamp_flips, clamp_singular_values, untangle
 from diffpoisson.restriction import extend, restrict
 from diffpoisson.sampling import SurfaceSamples, sample_surface
 from diffpoisson.spectral import (
@@ -26,16 +28,22 @@ from diffpoisson.spectral import (
     lumped_mass,
     wave_kernel_signature,
 )
+from diffpoisson.uvmap import UVMap, parameterize
 
 __all__ = [
+    "Certificate",
     "CleanedMesh",
     "Mesh",
     "MeshError",
     "PoissonSolver",
     "SlimResult",
     "SurfaceSamples",
+    "UVMap",
     "arap",
     "area_distortion",
+    "certify",
+    "clamp_flips",
+    "clamp_singular_values",
     "determinant",
     "divergence",
     "extend",
@@ -49,6 +57,7 @@ __all__ = [
     "lscm",
     "lumped_mass",
     "mips",
+    "parameterize",
     "procrustes",
     "restrict",
     "sample_surface",
@@ -57,5 +66,6 @@ __all__ = [
     "solve_poisson",
     "symmetric_dirichlet",
     "tutte",
+    "untangle",
     "wave_kernel_signature",
 ]

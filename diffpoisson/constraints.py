@@ -53,8 +53,8 @@ class Constraints:
         mesh: Mesh,
         *,
         gauge: Gauge | Bool[Tensor, "n"],
-        pins: Int[Tensor, "p"] | None,
-        handles: Int[Tensor, "h"] | None,
+        pins: Int[Tensor, "p"] | Bool[Tensor, "n"] | None,
+        handles: Int[Tensor, "h"] | Bool[Tensor, "n"] | None,
         handle_weights: Float[Tensor, "h"] | float,
         face_weights: Float[Tensor, "m"] | None,
     ) -> Constraints:

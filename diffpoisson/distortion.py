@@ -97,7 +97,7 @@ def lscm(J: Jacobian) -> Density:
     if _shape(J) == (3, 3):
         raise ValueError("lscm: defined for maps of surfaces only; use mips for volumes")
     if J.shape[-2] == 2:
-        return _similarity_parts(J)[1].square().sum(-1) / 2
+        return similarity_parts(J)[1].square().sum(-1) / 2
     return _sum_and_difference(J)[1].square() / 2
 
 
@@ -172,12 +172,12 @@ def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
     """σ₁ + σ₂ and σ₁ - σ₂, each without cancellation; subgradient zero where a norm vanishes."""
     if _shape(J) == (3, 2):
         return _spatial_sum_and_difference(J)
-    similarity, anti_similarity = _similarity_parts(J)
+    similarity, anti_similarity = similarity_parts(J)
     norm = torch.linalg.vector_norm
     return norm(similarity, dim=-1), norm(anti_similarity, dim=-1)
 
 
-def _similarity_parts(J: Tensor) -> tuple[Tensor, Tensor]:
+def similarity_parts(J: Tensor) -> tuple[Tensor, Tensor]:
     """J = similarity + anti-similarity, as vectors of length σ₁ + σ₂ and σ₁ - σ₂."""
     a, b, c, d = J.flatten(-2).unbind(-1)
     return torch.stack([a + d, c - b], dim=-1), torch.stack([a - d, c + b], dim=-1)

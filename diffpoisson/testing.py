@@ -115,7 +115,10 @@ def parts(seed: int = 0) -> Arrays:
 
 def planar_disk(seed: int = 0, size: int = 5) -> Arrays:
     """A jittered grid of the unit square, D = 2, counter-clockwise; its boundary is not moved."""
-    vertices = _jittered_grid(seed, size, 2)
+    vertices = _grid(size, 2)
+    inner = ((vertices > 0) & (vertices < 1)).all(axis=1)
+    jitter = np.random.default_rng(seed).uniform(-1, 1, (inner.sum(), 2))
+    vertices[inner] += 0.2 / (size - 1) * jitter
     return vertices, _quads(np.arange(size**2).reshape(size, size))
 
 
@@ -136,8 +139,11 @@ def tetrahedron(seed: int = 0) -> Arrays:
 
 
 def box(seed: int = 0, size: int = 3) -> Arrays:
-    """A jittered grid of the unit cube, six tetrahedra a cell; its boundary is not moved."""
-    vertices = _jittered_grid(seed, size, 3)
+    """A jittered grid, six tetrahedra a cell; its boundary stays that of the unit cube."""
+    vertices = _grid(size, 3)
+    inside = (vertices > 0) & (vertices < 1)  # along each axis
+    jitter = np.random.default_rng(seed).uniform(-1, 1, vertices.shape)
+    vertices += 0.2 / (size - 1) * jitter * inside
     grid = np.arange(size**3).reshape(size, size, size)
     # Kuhn: one tetrahedron for each order in which the axes can be walked along.
     paths = [((0, 1, 2), 1), ((1, 2, 0), 1), ((2, 0, 1), 1)]
@@ -179,8 +185,8 @@ def tetrahedral_parts(seed: int = 0) -> Arrays:
     hinge = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0.4], [1, 1, 0], [-1, -1, 0.3], [-1, 0, 0.6]])
     fan = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     pieces = (
-        (_jittered(hinge, seed), np.array([[0, 2, 3, 1], [0, 4, 5, 1]])),
-        (_jittered(2 * fan, seed) + 4, np.array([[0, 1, 2, 3], [0, 4, 5, 6]])),
+        (_jittered(hinge, seed), np.array([[0, 2, 3, 1], [0, 5, 4, 1]])),
+        (_jittered(2 * fan, seed) + 4, np.array([[0, 1, 2, 3], [0, 5, 4, 6]])),
         (_jittered(0.5 * vertices - 4, seed), cells),
     )
     return union(*pieces)
@@ -422,14 +428,10 @@ def _subdivided(vertices: np.ndarray, faces: np.ndarray) -> Arrays:
     return np.concatenate([vertices, midpoints]), np.concatenate([np.stack(q, 1) for q in quarters])
 
 
-def _jittered_grid(seed: int, size: int, D: int) -> np.ndarray:
-    """(size^D, D) points of the unit cube; those inside are moved by up to a fifth of a step."""
+def _grid(size: int, D: int) -> np.ndarray:
+    """(size^D, D) points of the unit cube."""
     axes = np.meshgrid(*D * [np.linspace(0, 1, size)], indexing="ij")
-    vertices = np.stack([x.ravel() for x in axes], axis=1)
-    inner = ((vertices > 0) & (vertices < 1)).all(axis=1)
-    jitter = np.random.default_rng(seed).uniform(-1, 1, (inner.sum(), D))
-    vertices[inner] += 0.2 / (size - 1) * jitter
-    return vertices
+    return np.stack([x.ravel() for x in axes], axis=1)
 
 
 def _periodic(count: int) -> np.ndarray:

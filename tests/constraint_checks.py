@@ -340,7 +340,7 @@ def check_gradients_of_images() -> None:
 
     phi = layer(*inputs)
     y = images(*phi.shape, seed=3)
-    gradients = torch.autograd.grad((phi * y).sum(), inputs)
+    gradients = torch.autograd.grad((phi * y).sum(), inputs, materialize_grads=True)
     for i, (gradient, step) in enumerate(zip(gradients, steps, strict=True)):
         moved = [x + step if i == j else x for j, x in enumerate(inputs)]
         change = ((layer(*moved) - phi) * y).sum().detach()
@@ -389,7 +389,7 @@ def check_geometry_gradient() -> None:
         layer, reference, mesh, weights = geometry_case(intrinsic)
         v, w = mesh.vertices.clone().requires_grad_(), weights.clone().requires_grad_()
         y = torch.from_numpy(normal((mesh.n_vertices, 2), 7))
-        actual = torch.autograd.grad((layer(v, w) * y).sum(), (v, w))
+        actual = torch.autograd.grad((layer(v, w) * y).sum(), (v, w), materialize_grads=True)
         expected = torch.autograd.grad((reference(v, w) * y).sum(), (v, w))
         for a, e in zip(actual, expected, strict=True):
             assert_near(a, e, SOLVE)
@@ -437,6 +437,25 @@ def check_geometry_derivatives_of_higher_order() -> None:
 
 def _derivative(curve: Callable, t: Tensor) -> Tensor:
     return jvp(curve, (t,), (torch.ones_like(t),))[1]
+
+
+@check
+def check_geometry_double_backward() -> None:
+    """Second derivatives by reverse mode twice, by positions, weights, and both."""
+    for intrinsic in (False, True):
+        layer, reference, mesh, weights = geometry_case(intrinsic)
+        y = images(mesh.n_vertices, 2, seed=7)
+        steps = images(mesh.n_vertices), images(mesh.n_faces, 1)[:, 0]
+
+        def curvature(function: Callable) -> tuple[Tensor, ...]:
+            inputs = mesh.vertices.clone().requires_grad_(), weights.clone().requires_grad_()  # noqa: B023
+            loss = (function(*inputs) * y).sum()  # noqa: B023
+            slopes = torch.autograd.grad(loss, inputs, create_graph=True)
+            along = sum((g * u).sum() for g, u in zip(slopes, steps, strict=True))  # noqa: B023
+            return torch.autograd.grad(along, inputs)
+
+        for actual, expected in zip(curvature(layer), curvature(reference), strict=True):
+            assert_near(actual, expected, SOLVE)
 
 
 @check

@@ -1,7 +1,7 @@
 """Named mistakes that a gradient and Poisson layer can have, each put into the real one.
 
-A fault is a context manager that patches the package's internals. `python -m tests.faults` runs
-every check under every fault and writes which checks notice to `docs/faults.md`.
+A fault is a context manager that patches the package's internals. `fault_table.py` runs every check
+under every fault.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ import torch
 from torch import Tensor
 
 from diffpoisson import cells, constraints, gradient, linear_map, mesh, poisson
-from tests.checks import CHECKS
 
 Patch = pytest.MonkeyPatch
 
@@ -38,15 +36,24 @@ class Fault(NamedTuple):
             yield
 
 
+Inject = Callable[[Patch], None]
+
+
+def registrar(faults: dict[str, Fault]) -> Callable[[str], Callable[[Inject], Inject]]:
+    """A decorator that adds a fault to a table."""
+
+    def fault(noticed_by: str) -> Callable[[Inject], Inject]:
+        def register(inject: Inject) -> Inject:
+            faults[inject.__name__] = Fault(inspect.getdoc(inject), noticed_by, inject)
+            return inject
+
+        return register
+
+    return fault
+
+
 FAULTS: dict[str, Fault] = {}
-
-
-def fault(noticed_by: str) -> Callable[[Callable[[Patch], None]], Callable[[Patch], None]]:
-    def register(inject: Callable[[Patch], None]) -> Callable[[Patch], None]:
-        FAULTS[inject.__name__] = Fault(inspect.getdoc(inject), noticed_by, inject)
-        return inject
-
-    return register
+fault = registrar(FAULTS)
 
 
 def wrap(patch: Patch, owner: Any, name: str, wrapper: Callable) -> None:
@@ -468,61 +475,3 @@ def mixed_vmap(patch):
 
 def _eye(L: sp.spmatrix) -> sp.spmatrix:
     return sp.eye(L.shape[0], format="csr")
-
-
-# ------------------------------------------------------- the table
-
-
-def outcome(check: Callable[[], None]) -> str:
-    """What a check says: nothing, ✗ for a failed assertion, ! for a crash."""
-    try:
-        check()
-    except AssertionError:
-        return "✗"
-    except Exception:
-        return "!"
-    return ""
-
-
-def table() -> str:
-    """A row for each fault, a column for each check, in Markdown."""
-    assert not any(outcome(check) for check in CHECKS.values())
-    rows = {}
-    for name, fault in FAULTS.items():
-        with fault.injected():
-            rows[name] = [outcome(check) for check in CHECKS.values()]
-    caught = {
-        name: sum(map(bool, column))
-        for name, column in zip(CHECKS, zip(*rows.values(), strict=True), strict=True)
-    }
-    assert min(caught.values()) > 0
-    lines = [
-        "# What the tests would notice",
-        "",
-        f"{len(FAULTS)} mistakes, put one at a time into the real layer (`tests/faults.py`),",
-        f"against {len(CHECKS)} checks (`tests/checks.py`). ✗ marks a check that fails, ! one that",
-        "crashes. Every mistake is noticed, and every check notices some. The customary round trip",
-        f"through the layer's own gradient notices {caught['round_trip']}.",
-        "",
-        "Written by `python -m tests.faults`; `tests/test_faults.py` asserts for each mistake that",
-        "a named check fails.",
-        "",
-        *(f"{i}. {_words(name)}" for i, name in enumerate(CHECKS, 1)),
-        "",
-        "| Fault | | " + " | ".join(str(i) for i in range(1, len(CHECKS) + 1)) + " |",
-        "|---|---|" + "---|" * len(CHECKS),
-    ]
-    for name, row in rows.items():
-        description = FAULTS[name].description.replace("\n", " ")
-        lines.append(f"| {_words(name)} | {description} | {' | '.join(row)} |")
-    lines.append(f"| **faults noticed** | | {' | '.join(map(str, caught.values()))} |")
-    return "\n".join(lines) + "\n"
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-if __name__ == "__main__":
-    page = Path(__file__).parents[1] / "docs" / "faults.md"
-    page.write_text(table(), encoding="utf-8")

@@ -207,3 +207,10 @@ def constrained_poisson(
     )
     # Not torch.linalg.solve, whose second derivatives by the matrix are wrong in torch 2.13.
     return (torch.linalg.inv(system) @ torch.cat([b / unit, q]))[:n]
+
+
+def symmetric_dirichlet(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Area-weighted mean of Σ σᵢ² + σᵢ⁻², singular values by LAPACK."""
+    sigma = np.linalg.svd(jacobians(vertices, faces, uv), compute_uv=False)[:, :2]
+    weights = areas(vertices, faces)
+    return (weights * (sigma**2 + sigma**-2.0).sum(1)).sum() / weights.sum()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
 import diffpoisson as dp
+from tests import meshes
 from tests.checks import assert_near
 
 #            as a function of the signed singular values
@@ -362,3 +363,145 @@ def test_wrong_shapes_raise(name, shape, unchecked):
     message = f"distortion: expected J of shape (…, 2, 2), (…, 3, 2) or (…, 3, 3), got {shape}"
     with pytest.raises(ValueError, match=re.escape(message)):
         getattr(dp, name)(torch.ones(shape))
+
+
+# ------------------------------------------------------- volumes
+
+#            as a function of the signed singular values
+VOLUME_ENERGIES = {
+    "symmetric_dirichlet": lambda s: (s**2 + s**-2).sum(-1),
+    "arap": lambda s: ((s - 1) ** 2).sum(-1),
+    "mips": lambda s: ((s**2).sum(-1) * (s**-2).sum(-1) - 1) / 4,
+    "area_distortion": lambda s: s.prod(-1) + 1 / s.prod(-1),
+    "isometric_amips": lambda s: torch.exp(
+        5 / 4 * (((s**2).sum(-1) * (s**-2).sum(-1) - 1) / 4 + s.prod(-1) + 1 / s.prod(-1))
+    ),
+}
+AT_VOLUME_ISOMETRY = dict(zip(VOLUME_ENERGIES, (6, 0, 2, 2, np.exp(5)), strict=True))
+volume_energies = pytest.mark.parametrize("name", VOLUME_ENERGIES)
+
+
+def rotation_in_space(seed: int) -> torch.Tensor:
+    return torch.from_numpy(meshes.rotation(np.random.default_rng(seed), np.zeros((1, 3))))
+
+
+def volume_jacobians(values: torch.Tensor, seed: int = 0) -> torch.Tensor:
+    """U diag(s) Vᵀ with random rotations."""
+    U, V = (
+        torch.stack([rotation_in_space(seed + 1000 * side + i) for i in range(len(values))])
+        for side in (1, 2)
+    )
+    return U @ torch.diag_embed(values) @ V.mT
+
+
+def random_values(count: int, *, flips: bool, seed: int = 0) -> torch.Tensor:
+    """Descending, between 0.1 and 10, the last one negative about half the time."""
+    rng = np.random.default_rng(seed)
+    values = np.sort(10 ** rng.uniform(-1, 1, (count, 3)), axis=1)[:, ::-1].copy()
+    if flips:
+        values[:, 2] *= rng.choice([-1, 1], count)
+    return torch.from_numpy(values)
+
+
+def test_singular_values_of_volumes():
+    """As constructed, by the number and by LAPACK; the sign is that of the determinant."""
+    values = random_values(100, flips=True)
+    J = volume_jacobians(values)
+    assert_near(dp.singular_values(J), values, 1e-14)
+    assert_near(dp.singular_values(J).abs(), torch.linalg.svdvals(J), 1e-15)
+    assert_near(dp.determinant(J), values.prod(1), 1e-13)
+    assert torch.equal(dp.flipped(J), values[:, 2] < 0)
+    expected = torch.where(
+        values[:, 2] > 0, torch.maximum(values[:, 0], 1 / values[:, 2]), torch.inf
+    )
+    torch.testing.assert_close(dp.isometric_distortion(J), expected, rtol=1e-12, atol=0)
+
+
+@volume_energies
+def test_energies_of_volumes_by_singular_values(name):
+    values = random_values(100, flips=name == "arap")
+    value = getattr(dp, name)(volume_jacobians(values))
+    expected = VOLUME_ENERGIES[name](values)
+    if name == "isometric_amips":
+        value, expected = value.log(), expected.log()
+    torch.testing.assert_close(value, expected, rtol=1e-10, atol=1e-13)
+
+
+@volume_energies
+def test_volumes_at_isometries(name):
+    J = torch.stack([torch.eye(3).double(), rotation_in_space(3)])
+    expected = torch.full((2,), AT_VOLUME_ISOMETRY[name], dtype=torch.float64)
+    torch.testing.assert_close(getattr(dp, name)(J), expected, rtol=1e-13, atol=1e-14)
+    nearby = J[1] + 1e-3 * torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3, 3)))
+    assert (getattr(dp, name)(nearby) >= expected[0] * (1 - 1e-12)).all()
+
+
+def test_arap_of_volumes_is_the_distance_to_the_nearest_rotation():
+    J = torch.from_numpy(np.random.default_rng(0).standard_normal((100, 3, 3)))
+    U, _, Vt = np.linalg.svd(J.numpy())
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    assert_near(dp.arap(J), ((J.numpy() - U @ Vt) ** 2).sum((1, 2)), 1e-14)
+
+
+@pytest.mark.parametrize("name", [*VOLUME_ENERGIES, "singular_values", "determinant"])
+@pytest.mark.parametrize("epsilon", [0.0, 0.3])
+def test_derivatives_of_volumes(name, epsilon):
+    exponential = name == "isometric_amips"  # leaves float64's range at flips
+    values = random_values(4, flips=not exponential and (epsilon or name not in BARRIERS), seed=2)
+    J = volume_jacobians(values)
+    energy = getattr(dp, name)
+
+    def function(J):
+        value = energy(J, epsilon) if name in BARRIERS else energy(J)
+        return value.log() if name == "isometric_amips" else value
+
+    assert gradcheck(function, J.requires_grad_(), rtol=1e-4, atol=1e-4)
+    assert gradgradcheck(function, J, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", [*VOLUME_ENERGIES, "singular_values", "determinant"])
+def test_gradients_of_volumes_where_values_repeat_or_vanish(name):
+    """Finite, where `torch.linalg.svd` has none: isometries above all."""
+    energy = getattr(dp, name)
+    for values in ((1.0, 1, 1), (2, 2, 1), (2, 1, 1), (3, 3, -3), (1, 1, 0), (1, 0, 0), (0, 0, 0)):
+        J = volume_jacobians(torch.tensor([values], dtype=torch.float64)).requires_grad_()
+        value = energy(J)
+        value.sum().backward()
+        assert J.grad.isfinite().all(), values
+        assert not value.isnan().any()
+        if values == (1, 1, 1) and name in VOLUME_ENERGIES:
+            assert J.grad.abs().max() < 1e-10 * max(1, value.item())
+
+
+@pytest.mark.parametrize("name", BARRIERS)
+def test_flipped_volumes(name):
+    """Infinite with zero gradient; regularised, descent increases the determinant."""
+    values = random_values(30, flips=False)
+    values[:, 2] *= -1
+    J = volume_jacobians(0.1 * values).requires_grad_()
+    energy = getattr(dp, name)
+    (slope,) = torch.autograd.grad(energy(J).sum(), J)
+    assert (energy(J) == torch.inf).all()
+    assert (slope == 0).all()
+    value = energy(J, 0.5)
+    value = value.log() if name == "isometric_amips" else value
+    (slope,) = torch.autograd.grad(value.sum(), J)
+    (towards_positive,) = torch.autograd.grad(dp.determinant(J).sum(), J)
+    assert value.isfinite().all()
+    assert ((slope * towards_positive).sum((1, 2)) < 0).all()
+
+
+def test_lscm_is_for_surfaces(unchecked):
+    with pytest.raises(ValueError, match="lscm: defined for maps of surfaces only; use mips"):
+        dp.lscm(torch.eye(3))
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 0), (2, 3)])
+def test_batches_of_volumes(batch):
+    J = torch.from_numpy(np.random.default_rng(0).standard_normal((*batch, 3, 3)))
+    for name in [*VOLUME_ENERGIES, "determinant", "flipped", "isometric_distortion"]:
+        values = getattr(dp, name)(J)
+        assert values.shape == batch
+        for index in np.ndindex(*batch):
+            assert torch.equal(values[index], getattr(dp, name)(J[index]))
+    assert dp.singular_values(J).shape == (*batch, 3)

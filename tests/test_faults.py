@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.checks import CHECKS
-from tests.faults import FAULTS, outcome
+from tests.fault_table import CHECKS, FAULTS, outcome
 
 
 @pytest.mark.parametrize("name", FAULTS)

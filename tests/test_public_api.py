@@ -12,14 +12,19 @@ import pytest
 import diffpoisson as dp
 
 NAMES = [
+    "Certificate",
     "CleanedMesh",
     "Mesh",
     "MeshError",
     "PoissonSolver",
     "SlimResult",
     "SurfaceSamples",
+    "UVMap",
     "arap",
     "area_distortion",
+    "certify",
+    "clamp_flips",
+    "clamp_singular_values",
     "determinant",
     "divergence",
     "extend",
@@ -33,6 +38,7 @@ NAMES = [
     "lscm",
     "lumped_mass",
     "mips",
+    "parameterize",
     "procrustes",
     "restrict",
     "sample_surface",
@@ -41,6 +47,7 @@ NAMES = [
     "solve_poisson",
     "symmetric_dirichlet",
     "tutte",
+    "untangle",
     "wave_kernel_signature",
 ]
 

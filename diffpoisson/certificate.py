@@ -1,0 +1,138 @@
+"""What is certain of a planar map: the signs of its triangles and the simplicity of its boundary.
+
+Signs are decided in exact arithmetic on the floating-point coordinates as they stand. A map of a
+disk whose triangles are all positively oriented and whose boundary is a simple polygon is
+one-to-one: a point has as many preimages as the boundary winds around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from diffpoisson.distortion import determinant, isometric_distortion, symmetric_dirichlet
+from diffpoisson.gradient import jacobians
+from diffpoisson.mesh import Mesh
+
+# A computed orientation (a - c) × (b - c) has the right sign if it exceeds 3u + 16u² times the sum
+# of the magnitudes of its two products, u the unit roundoff (Shewchuk 1997).
+_U = 2.0**-53
+_ORIENTATION_BOUND = (3 + 16 * _U) * _U
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Facts about a map of a triangle mesh to the plane.
+
+    Attributes:
+        n_flipped: triangles that are not positively oriented, decided exactly.
+        simple_boundary: whether the boundary is one polygon that does not touch itself, decided
+            exactly.
+        min_determinant: smallest det J.
+        max_distortion: largest max(σ₁, 1/σ₂), infinite at a flip.
+        energy: area-weighted mean symmetric Dirichlet energy, 4 at an isometry, infinite at a flip.
+    """
+
+    n_flipped: int
+    simple_boundary: bool
+    min_determinant: float
+    max_distortion: float
+    energy: float
+
+    @property
+    def injective(self) -> bool:
+        """Whether the map of a disk is one-to-one."""
+        return self.n_flipped == 0 and self.simple_boundary
+
+
+def certify(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Certificate:
+    """Check a map of a disk; a surface in space or a planar mesh.
+
+    Args:
+        mesh: a topological disk.
+        uv: (n, 2) the map.
+    """
+    J = jacobians(mesh, uv)
+    density = symmetric_dirichlet(J).double()
+    areas = mesh._double_measures
+    points = uv.detach().cpu().double().numpy()
+    loops = [loop.cpu().numpy() for loop in mesh.boundary_loops]
+    return Certificate(
+        n_flipped=int((orientations(points[mesh.faces.cpu().numpy()]) <= 0).sum()),
+        simple_boundary=len(loops) == 1 and is_simple(points[loops[0]]),
+        min_determinant=float(determinant(J).min()),
+        max_distortion=float(isometric_distortion(J).max()),
+        energy=float((areas * density).sum() / areas.sum()),
+    )
+
+
+def orientations(triangles: Float[np.ndarray, "m 3 2"]) -> np.ndarray:
+    """Exact sign of each triangle's area, (m,): 1 counter-clockwise, 0 flat, -1 clockwise."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    left = (a[:, 0] - c[:, 0]) * (b[:, 1] - c[:, 1])
+    right = (a[:, 1] - c[:, 1]) * (b[:, 0] - c[:, 0])
+    signs = np.sign(left - right).astype(int)
+    unsure = np.abs(left - right) <= _ORIENTATION_BOUND * (np.abs(left) + np.abs(right))
+    for i in np.flatnonzero(unsure):  # few: nearly collinear corners
+        signs[i] = _exact_orientation(triangles[i])
+    return signs
+
+
+def _exact_orientation(triangle: np.ndarray) -> int:
+    (ax, ay), (bx, by), (cx, cy) = [[Fraction(float(x)) for x in corner] for corner in triangle]
+    area = (ax - cx) * (by - cy) - (ay - cy) * (bx - cx)
+    return (area > 0) - (area < 0)
+
+
+def is_simple(polygon: Float[np.ndarray, "b 2"], chunk: int = 512) -> bool:
+    """Whether a closed polygon's edges meet only at shared corners, decided exactly.
+
+    Compares the bounding boxes of all pairs of edges, a chunk of edges at a time, and then the
+    pairs whose boxes meet.
+    """
+    n = len(polygon)
+    ends = np.roll(polygon, -1, axis=0)
+    low, high = np.minimum(polygon, ends), np.maximum(polygon, ends)
+    for start in range(0, n, chunk):
+        rows = np.arange(start, min(start + chunk, n))[:, None]
+        columns = np.arange(n)[None]
+        meet = (low[rows] <= high[columns]).all(-1) & (low[columns] <= high[rows]).all(-1)
+        i, j = np.nonzero(meet & (columns > rows))
+        if _any_improper_contact(polygon, i + start, j):
+            return False
+    return True
+
+
+def _any_improper_contact(polygon: np.ndarray, i: np.ndarray, j: np.ndarray) -> bool:
+    """Whether any edge i meets its edge j > i other than at the corner that neighbours share."""
+    n = len(polygon)
+    a, b, c, d = (polygon[k % n] for k in (i, i + 1, j, j + 1))
+    adjacent = (j == i + 1) | ((i == 0) & (j == n - 1))
+    apart = ~adjacent
+    if _segments_meet(a[apart], b[apart], c[apart], d[apart]).any():
+        return True
+    # Neighbours share a corner; they overlap if collinear and folded back.
+    shared = np.where((j == i + 1)[:, None], b, a)[adjacent]
+    first = np.where((j == i + 1)[:, None], a, b)[adjacent]
+    other = np.where((j == i + 1)[:, None], d, c)[adjacent]
+    collinear = orientations(np.stack([first, shared, other], axis=1)) == 0
+    folded = ((first - shared) * (other - shared)).sum(-1) >= 0
+    return bool((collinear & folded).any())
+
+
+def _segments_meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Whether closed segments ab and cd, whose bounding boxes meet, have a common point.
+
+    They do unless one lies strictly on one side of the other's line.
+    """
+    if len(a) == 0:
+        return np.zeros(0, dtype=bool)
+    abc, abd, cda, cdb = (
+        orientations(np.stack(corners, axis=1))
+        for corners in ((a, b, c), (a, b, d), (c, d, a), (c, d, b))
+    )
+    return (abc * abd <= 0) & (cda * cdb <= 0)

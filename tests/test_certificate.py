@@ -1,0 +1,119 @@
+"""Certificates against exact arithmetic, brute force, and maps that are known to overlap."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+import diffpoisson as dp
+from diffpoisson.certificate import certify, is_simple, orientations
+from tests import meshes
+
+
+def exact_orientation(triangle) -> int:
+    (ax, ay), (bx, by), (cx, cy) = [[Fraction(float(x)) for x in p] for p in triangle]
+    area = ax * (by - cy) + bx * (cy - ay) + cx * (ay - by)
+    return (area > 0) - (area < 0)
+
+
+@given(seed=st.integers(0, 10**6), scale=st.sampled_from([1e-6, 1.0, 1e6]))
+def test_orientations_are_exact_next_to_collinear(seed, scale):
+    """Points on a line through far corners, moved by a few units in the last place."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.standard_normal((2, 30, 2)) * scale
+    c = a + rng.uniform(-1, 2, (30, 1)) * (b - a)
+    for _ in range(rng.integers(3)):
+        c = np.nextafter(c, rng.choice([-np.inf, np.inf], c.shape))
+    triangles = np.stack([a, b, c], axis=1)
+    assert orientations(triangles).tolist() == [exact_orientation(t) for t in triangles]
+
+
+def test_exactly_collinear_and_coincident_corners_are_zero():
+    triangles = np.array(
+        [[[0, 0], [1, 1], [3, 3]], [[0.1, 0.1], [0.1, 0.1], [5, 7]], [[0, 0], [1, 0], [0, 1]]]
+    )
+    assert orientations(triangles).tolist() == [0, 0, 1]
+
+
+def brute_force_simple(polygon: np.ndarray) -> bool:
+    """Every pair of edges, in rationals."""
+    points = [tuple(Fraction(float(x)) for x in p) for p in polygon]
+    n = len(points)
+
+    def side(p, q, r):
+        value = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        return (value > 0) - (value < 0)
+
+    def on(p, q, r):
+        inside = all(min(p[k], q[k]) <= r[k] <= max(p[k], q[k]) for k in (0, 1))
+        return side(p, q, r) == 0 and inside
+
+    for i in range(n):
+        a, b = points[i], points[(i + 1) % n]
+        if a == b:
+            return False
+        for j in range(i + 1, n):
+            c, d = points[j], points[(j + 1) % n]
+            if j == i + 1 or (i == 0 and j == n - 1):
+                far, near = (d, a) if j == i + 1 else (c, b)
+                if on(a, b, far) or on(c, d, near):
+                    return False
+                continue
+            proper = side(a, b, c) * side(a, b, d) < 0 and side(c, d, a) * side(c, d, b) < 0
+            touching = on(a, b, c) or on(a, b, d) or on(c, d, a) or on(c, d, b)
+            if proper or touching:
+                return False
+    return True
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(3, 9), grid=st.booleans())
+def test_simplicity_against_brute_force(seed, n, grid):
+    """Random polygons, also on a coarse grid where edges touch and overlap."""
+    rng = np.random.default_rng(seed)
+    polygon = rng.integers(0, 5, (n, 2)).astype(float) if grid else rng.standard_normal((n, 2))
+    assert is_simple(polygon) == brute_force_simple(polygon)
+    assert is_simple(polygon, chunk=2) == is_simple(polygon)
+
+
+def test_regular_polygons_are_simple_and_stars_are_not():
+    angle = 2 * np.pi * np.arange(1001) / 1001
+    assert is_simple(np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    assert not is_simple(np.stack([np.cos(2 * angle), np.sin(2 * angle)], axis=1))
+
+
+def test_a_spike_that_folds_back_is_not_simple():
+    assert not is_simple(np.array([[0.0, 0], [2, 0], [1, 0], [1, 1]]))
+    assert not is_simple(np.array([[0.0, 0], [1, 0], [1, 1], [1, 0]]))
+
+
+def test_certificate_of_isometry_flip_and_spiral():
+    mesh = dp.Mesh(*meshes.planar_disk())
+    identity = certify(mesh, mesh.vertices)
+    assert identity.injective
+    assert identity.energy == pytest.approx(4)
+    assert identity.max_distortion == pytest.approx(1)
+    assert identity.min_determinant == pytest.approx(1)
+
+    mirrored = certify(mesh, mesh.vertices * torch.tensor([-1.0, 1]).double())
+    assert mirrored.n_flipped == mesh.n_faces
+    assert mirrored.simple_boundary
+    assert not mirrored.injective
+    assert mirrored.energy == np.inf
+
+    # A long strip wound more than once around an annulus: no flips, yet it covers itself.
+    x, y = np.meshgrid(np.linspace(0, 1, 41), [0, 0.1], indexing="ij")
+    a = 2 * np.arange(40)
+    lower, upper = (a, a + 2, a + 1), (a + 1, a + 2, a + 3)
+    faces = np.concatenate([np.stack(lower, axis=1), np.stack(upper, axis=1)])
+    strip = dp.Mesh(np.stack([x.ravel(), y.ravel()], axis=1), faces)
+    angle, radius = 3 * np.pi * x.ravel(), 1 - y.ravel()
+    spiral = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    wound = certify(strip, torch.from_numpy(spiral))
+    assert wound.n_flipped == 0
+    assert not wound.simple_boundary
+    assert not wound.injective

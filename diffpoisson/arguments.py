@@ -59,7 +59,8 @@ def to_tensor(operation: str, name: str, value: object, device: torch.device) ->
         TypeError: not numeric, complex, or without values.
     """
     try:
-        tensor = as_tensor(value, device)
+        # Through NumPy, where Python's numbers keep their 64 bits; torch would round to float32.
+        tensor = as_tensor(value if isinstance(value, Tensor) else np.array(value), device)
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(f"{operation}: {name} must be numeric: {error}") from error
     if tensor.is_complex() or tensor.layout != torch.strided:

@@ -118,4 +118,5 @@ def _facet_normals(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3"]:
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(vectors, dim=-1)
+    # Not torch.linalg.vector_norm: reverse over twice-nested forward mode raises in torch 2.13.
+    return vectors.square().sum(-1).sqrt()

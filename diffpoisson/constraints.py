@@ -14,6 +14,7 @@ from torch import Tensor
 from diffpoisson import topology
 from diffpoisson.arguments import to_tensor
 from diffpoisson.mesh import Mesh, describe_indices
+from diffpoisson.transforms import is_constant
 
 Gauge = Literal["mean", "vertex"]
 
@@ -180,13 +181,13 @@ def _strengths(mesh: Mesh, handles: Tensor, weights: Tensor | float) -> Float[Te
 
 def _constant(name: str, values: Tensor | float, mesh: Mesh) -> Tensor:
     """A float64 copy, of what has no derivative."""
-    values = to_tensor("PoissonSolver", name, values, mesh.device)
-    if values.requires_grad:
+    if isinstance(values, Tensor) and not is_constant(values):
         _fail(
             f"{name} require grad, but a factor is constant, so their gradient would silently be "
             f"wrong; pass {name}.detach() here, and face_weights=... to the solver's call if "
             "derivatives by them are wanted"
         )
+    values = to_tensor("PoissonSolver", name, values, mesh.device)
     return values.double().clone()
 
 

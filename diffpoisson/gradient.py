@@ -38,7 +38,9 @@ class SparseMatrix(Matrix):
 
     def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
         """A x."""
-        return self._in(x.dtype) @ x
+        # Autocast would round geometry to half precision behind the caller's back.
+        with torch.autocast(x.device.type, enabled=False):
+            return self._in(x.dtype) @ x
 
     def transposed(self) -> SparseMatrix:
         """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""
@@ -108,6 +110,12 @@ _operators: WeakKeyDictionary[Mesh, GradientOperator] = WeakKeyDictionary()
 def gradient_operator(mesh: Mesh) -> GradientOperator:
     """The mesh's operators, assembled at the first call and kept as long as the mesh lives."""
     if mesh not in _operators:
+        if torch.compiler.is_compiling():
+            raise RuntimeError(
+                "the operators of this mesh are not assembled yet, and torch.compile cannot trace "
+                "that; make a PoissonSolver of the mesh, or call the function once, before "
+                "compiled code runs"
+            )
         with outside_transforms():
             _operators[mesh] = GradientOperator(mesh)
     return _operators[mesh]

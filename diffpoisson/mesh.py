@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffpoisson import cells, topology
 from diffpoisson.arguments import as_tensor, require_instances, require_integer, require_tensor
-from diffpoisson.transforms import constant_property, is_transformed, outside_transforms
+from diffpoisson.transforms import constant_property, is_constant, outside_transforms
 
 ArrayLike = Tensor | np.ndarray
 
@@ -470,7 +470,7 @@ def _is_integer(values: Tensor) -> bool:
 
 
 def _require_constant(vertices: ArrayLike) -> None:
-    if isinstance(vertices, Tensor) and (vertices.requires_grad or is_transformed(vertices)):
+    if isinstance(vertices, Tensor) and not is_constant(vertices):
         raise MeshError(
             "Mesh: vertices require grad, but a mesh is constant, so their gradient would silently "
             "be zero; pass vertices.detach() here, and vertices=... to jacobians, divergence or "

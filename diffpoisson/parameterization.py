@@ -29,6 +29,7 @@ from diffpoisson.distortion import flipped, symmetric_dirichlet
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import jacobians, laplacian
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
+from diffpoisson.transforms import is_constant
 
 
 class SlimResult(NamedTuple):
@@ -114,7 +115,7 @@ def slim(
     require_integer("slim", "max_iterations", max_iterations, least=0)
     require_tensor("slim", "init", init, mesh.device)
     require_single_or_double("slim", "init", init)
-    if init.requires_grad:
+    if not is_constant(init):
         raise ValueError("slim: init requires grad, but SLIM is not differentiable; detach it")
     if init.shape != (mesh.n_vertices, 2):
         raise ValueError(

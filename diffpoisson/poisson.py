@@ -112,6 +112,8 @@ class PoissonSolver:
         self._handle_rows = free_index[constraints.handles]
         rows = torch.where(free_index < 0, len(constraints.free), free_index)
         self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
+        # A copy: edited in place, even the mesh's own positions must not pass for the factor's.
+        self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
         self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
@@ -327,14 +329,14 @@ class PoissonSolver:
         """The geometry as a function of the given positions and weights; None if none is given."""
         if vertices is None and face_weights is None:
             return None
-        own = (self.mesh.vertices, self.constraints.face_weights)
+        own = (self._vertices, self.constraints.face_weights)
         given = (vertices, face_weights)
         for name, mine, yours in zip(("vertices", "face_weights"), own, given, strict=True):
             if yours is not None:
                 require_tensor("PoissonSolver", name, yours, self.mesh.device)
                 require_equal(
                     yours.double(),
-                    mine.double(),
+                    mine,
                     f"PoissonSolver: {name} differ from those that were factorised; solve with "
                     "solver.update(vertices), or with a solver of these weights",
                 )

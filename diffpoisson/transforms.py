@@ -70,6 +70,13 @@ def concrete(value: Tensor) -> Tensor | None:
     return value.detach()
 
 
+def is_constant(value: Tensor) -> bool:
+    """Whether no derivative or batch can come with a tensor, by whatever transform."""
+    if value.requires_grad or is_transformed(value):
+        return False
+    return forward_ad.unpack_dual(value).tangent is None
+
+
 def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
     """Raise unless a tensor, under whatever transforms, has the expected values.
 

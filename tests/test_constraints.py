@@ -399,3 +399,14 @@ def test_positions_of_another_shape_raise(unchecked):
             function(mesh.vertices[:24])
         with pytest.raises(ValueError, match=r"vertices"):
             function(mesh.vertices[:, :2])
+
+
+def test_a_number_is_not_rounded(unchecked):
+    """A weight given as a Python number is that number, not its float32 rounding."""
+    mesh = dp.Mesh(*meshes.disk())
+    R, handles, q = field(mesh), torch.tensor([3, 7]), torch.ones(2, 3, dtype=torch.float64)
+    for weights in (0.7, [0.7, 0.7]):
+        given = dp.PoissonSolver(mesh, handles=handles, handle_weights=weights)
+        exact = torch.full((2,), 0.7, dtype=torch.float64)
+        expected = dp.PoissonSolver(mesh, handles=handles, handle_weights=exact)
+        assert torch.equal(given(R, handles=q), expected(R, handles=q))

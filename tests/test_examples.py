@@ -26,6 +26,17 @@ def test_uv_train(tmp_path, monkeypatch):
     assert (tmp_path / "run" / "results.png").stat().st_size > 100_000
 
 
+def test_fit_source(tmp_path):
+    """Newton's convergence: only an exact derivative by the geometry squares the error."""
+    main = runpy.run_path(str(ROOT / "examples" / "fit_source.py"))["main"]
+    results = main(["--edge", "0.6", "--steps", "4", "--out", str(tmp_path)])
+    before, after = results["distances"][0], results["distances"][-1]
+    assert 0.1 < before < 0.2
+    assert after < 1e-6 * before
+    assert (tmp_path / "source.png").stat().st_size > 50_000
+    assert (tmp_path / "source.obj").stat().st_size > 1_000
+
+
 def test_tables_are_those_of_the_results():
     script = runpy.run_path(str(ROOT / "docs" / "update_tables.py"))
     pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]

@@ -39,7 +39,33 @@ def uv_train() -> str:
     )
 
 
-TABLES = {"uv_train": uv_train}
+def transforms() -> str:
+    """Peers under torch's transforms, from `tests/benchmarks/transforms_table.py`."""
+    results = json.loads((RESULTS / "transforms.json").read_text())
+    columns = {
+        f"{name}, {what}": cells
+        for name, kinds in results["rows"].items()
+        if "missing" not in kinds
+        for what, cells in kinds.items()
+    }
+    lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
+    for name in results["transforms"]:
+        row = [transforms_cell(cells[name]) for cells in columns.values()]
+        lines.append(f"| {name} | " + " | ".join(row) + " |")
+    missing = [name for name, kinds in results["rows"].items() if "missing" in kinds]
+    listed = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    absent = f" Not installed: {', '.join(missing)}." if missing else ""
+    return "\n".join([*lines, "", f"Measured with {listed}.{absent}"])
+
+
+def transforms_cell(result: dict) -> str:
+    """✓, raises, or WRONG with the relative error."""
+    if result["outcome"] == "WRONG":
+        return f"**WRONG** ({result['relative error']:.0e})"
+    return {"correct": "✓", "raises": "raises"}[result["outcome"]]
+
+
+TABLES = {"uv_train": uv_train, "transforms": transforms}
 
 
 def number(value: float | None) -> str:

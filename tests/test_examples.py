@@ -39,9 +39,22 @@ def test_fit_source(tmp_path):
 
 def test_tables_are_those_of_the_results():
     script = runpy.run_path(str(ROOT / "docs" / "update_tables.py"))
-    text = (ROOT / "README.md").read_text()
-    assert "<!-- table:uv_train -->" in text
-    assert script["updated"](text) == text
+    pages = [path.read_text() for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
+    for name in script["TABLES"]:
+        assert any(f"<!-- table:{name} -->" in text for text in pages)
+    for text in pages:
+        assert script["updated"](text) == text
+
+
+PAGES = [page for page in sorted((ROOT / "docs").glob("*.md")) if "```python" in page.read_text()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_examples_of_a_page(page):
+    """The blocks of a page, one after the other in one namespace, with their assertions."""
+    namespace: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL):
+        exec(block, namespace)
 
 
 def test_readme_example():

@@ -297,3 +297,21 @@ def test_reproducible():
     mesh = dp.Mesh(*large("disk"))
     first, again = (dp.laplacian_eigenpairs(mesh, LANCZOS)[1] for _ in range(2))
     assert torch.equal(first, again)
+
+
+@pytest.mark.parametrize("times", [[-1.0], [torch.inf], [torch.nan], [[1.0]]])
+def test_times_that_are_none_raise(times, unchecked):
+    with pytest.raises(ValueError, match=r"heat_kernel_signature: times must be \(t,\), finite"):
+        dp.heat_kernel_signature(dp.Mesh(*meshes.disk()), torch.tensor(times), n_eigenpairs=3)
+
+
+def test_eigenvalues_that_rounding_hides_raise():
+    """An eigenvalue that comes out negative would be a NaN in the logarithm of a signature."""
+    vertices, faces = meshes.disk(0, 4)
+    mesh = dp.Mesh(vertices * [1, 1e-11, 1], faces)
+    try:
+        values, _ = dp.laplacian_eigenpairs(mesh, 16)
+    except dp.MeshError as error:
+        assert "thin" in str(error)  # noqa: PT017 - either ending is right
+    else:
+        assert (values[1:] > 0).all()

@@ -31,7 +31,7 @@ Function = Callable[[Tensor], Tensor]
 DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 # Of quantities that went through up to three derivatives and a cube.
-RTOL = {torch.float64: 1e-9, torch.float32: 2e-3}
+RTOL = {torch.float64: 1e-11, torch.float32: 2e-5}
 
 
 # ------------------------------------------------------- layers

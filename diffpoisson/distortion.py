@@ -77,7 +77,7 @@ def symmetric_dirichlet(J: Jacobian, epsilon: float = 0.0) -> Density:
     Regularised: ‖J‖² + ‖cof J‖² / χ².
     """
     chi = _positive_determinant(J, epsilon)
-    return _guard(_squared_norm(J) + _squared_cofactors(J) * chi**-2, chi)
+    return _guard(_squared_norm(J) + _squared_inverse(J, chi), chi)
 
 
 def arap(J: Jacobian) -> Density:
@@ -108,7 +108,7 @@ def mips(J: Jacobian, epsilon: float = 0.0) -> Density:
     """
     chi = _positive_determinant(J, epsilon)
     if _shape(J) == (3, 3):
-        return _guard((_squared_norm(J) * _squared_cofactors(J) * chi**-2 - 1) / 4, chi)
+        return _guard((_squared_norm(J) * _squared_inverse(J, chi) - 1) / 4, chi)
     return _guard(_squared_norm(J) / chi, chi)
 
 
@@ -159,13 +159,14 @@ def _squared_norm(J: Tensor) -> Tensor:
     return J.square().sum(dim=(-2, -1))
 
 
-def _squared_cofactors(J: Tensor) -> Tensor:
-    """‖cof J‖² = ‖J⁻¹‖² det² J: the sum over i of the product of all σⱼ² with j ≠ i."""
+def _squared_inverse(J: Tensor, chi: Tensor) -> Tensor:
+    """‖cof J / χ‖², which is ‖J⁻¹‖² for χ = det J; squared last, so that it does not overflow."""
     if _shape(J)[1] == 2:
-        return _squared_norm(J)
+        return _squared_norm(J / chi[..., None, None])
     a, b, c = J.unbind(-1)
     cross = torch.linalg.cross
-    return _squared_norm(torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=-1))
+    cofactors = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=-1)
+    return _squared_norm(cofactors / chi[..., None, None])
 
 
 def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
@@ -195,7 +196,7 @@ def _spatial_sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
 
 def _sqrt(x: Tensor) -> Tensor:
     """√x with subgradient zero at zero."""
-    return torch.where(x > 0, torch.where(x > 0, x, 1).sqrt(), 0)
+    return torch.where(x > 0, torch.where(x > 0, x, 1).sqrt(), 0 * x)  # NaN stays NaN
 
 
 def _positive_determinant(J: Tensor, epsilon: float) -> Tensor:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from diffpoisson import cells
 from diffpoisson.arguments import require_single_or_double, require_tensor
+from diffpoisson.intrinsic import intrinsic_delaunay_laplacian
 from diffpoisson.linear_map import LinearMap, Matrix
 from diffpoisson.mesh import Mesh, require_cells, require_mesh
 from diffpoisson.restriction import extend, restrict
@@ -191,9 +192,21 @@ def divergence(
     return columns_to_vertices(operator.adjoint(operator.weights.to(R.dtype) * columns), R.shape)
 
 
-def laplacian(mesh: Mesh) -> sp.csr_matrix:
-    """The cotangent Laplacian L = ∇ᵀA∇, (n, n), symmetric positive semi-definite, float64."""
+def laplacian(mesh: Mesh, *, intrinsic_delaunay: bool = False) -> sp.csr_matrix:
+    """The cotangent Laplacian L = ∇ᵀA∇, (n, n), symmetric positive semi-definite, float64.
+
+    Args:
+        mesh: the domain.
+        intrinsic_delaunay: that of the surface's intrinsic Delaunay triangulation instead, see
+            `intrinsic.py`: better on thin, obtuse faces. Not for fitting Jacobians, which belong to
+            the original faces: only L itself reproduces the map that they came from.
+
+    Raises:
+        MeshError: tetrahedra, or very thin faces, with intrinsic_delaunay.
+    """
     require_mesh("laplacian", mesh)
+    if intrinsic_delaunay:
+        return intrinsic_delaunay_laplacian(mesh)
     return gradient_operator(mesh).laplacian.copy()
 
 

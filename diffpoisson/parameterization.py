@@ -1,4 +1,6 @@
-"""Flattening a disk: Tutte's embedding, SLIM, and rigid alignment. The only file that uses libigl.
+"""Flattening a disk: Tutte's embedding, SLIM, and rigid alignment.
+
+With `intrinsic.py` the only file that uses libigl.
 
 Tutte: boundary on a circle, interior solving L uv = 0. With uniform weights the result is an
 embedding (Tutte 1963; Floater 1997); cotangent weights distort less but can flip faces next to

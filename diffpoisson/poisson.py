@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from diffpoisson import cells
-from diffpoisson.arguments import require_instances, require_tensor
+from diffpoisson.arguments import require_instances, require_integer, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
 from diffpoisson.factor import BlockDiagonal, CholeskyFactor
 from diffpoisson.gradient import (
@@ -174,6 +174,7 @@ class PoissonSolver:
         transforms: Float[Tensor, "*#batch m c c"] | None = None,
         vertices: Float[Tensor, "n D"] | None = None,
         face_weights: Float[Tensor, "m"] | None = None,
+        refinements: int = 0,
     ) -> Float[Tensor, "*batch n c"]:
         """The map whose Jacobians are closest to R in the area-weighted least-squares sense.
 
@@ -188,6 +189,8 @@ class PoissonSolver:
             vertices: (n, D) the mesh's own positions again, if derivatives by them are wanted.
             face_weights: (m,) the solver's own face weights again, if derivatives by them are
                 wanted.
+            refinements: solve this many times again, for what of R the gradient of the solution
+                misses. Each doubles the digits that thin faces leave, at the price of a solve.
 
         Returns:
             (…, n, c) images of the vertices, in the dtype of R.
@@ -198,6 +201,7 @@ class PoissonSolver:
             TypeError: what should be a tensor is none, or not of floating dtype.
         """
         require_tensor("PoissonSolver", "R", R, self.mesh.device)
+        require_integer("PoissonSolver", "refinements", refinements, least=0)
         geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
         intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
@@ -228,6 +232,13 @@ class PoissonSolver:
             x = self._moving_inverse(geometry.stiffness(weights), b)
             means = constraints.mean_weights(geometry.vertex_measures())
         phi = self._scattered(x, q_pins)
+        if refinements and geometry is not None:
+            raise ValueError(
+                "PoissonSolver: refinements know the mesh's own geometry only; leave them out "
+                "where derivatives by vertices or face_weights are wanted"
+            )
+        for _ in range(refinements):
+            phi = self._refined(phi, intrinsic, pull)
         phi = self._placed(phi, means, translations, batch, c)
         return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
 
@@ -262,6 +273,25 @@ class PoissonSolver:
     ) -> Float[Tensor, "count k"]:
         _require_shape(name, values, batch, (count, c), self.mesh.device)
         return vertices_to_columns(values.double().expand(*batch, count, c))
+
+    def _refined(
+        self,
+        phi: Float[Tensor, "n k"],
+        R: Float[Tensor, "*batch m c d"],
+        pull: Float[Tensor, "h k"] | None,
+    ) -> Float[Tensor, "n k"]:
+        """Φ + L⁻¹ (∇ᵀA (R - ∇Φ) + W (q - Φ)).
+
+        The misfit of the gradient, unlike b - L Φ, is small where the solution is good: thin faces
+        do not cancel its digits.
+        """
+        constraints = self.constraints
+        misfit = matrices_to_columns(R) - gradient_operator(self.mesh).gradient(phi)
+        b = self._divergence(misfit)
+        if pull is not None:
+            held = constraints.handle_weights[:, None] * phi[constraints.handles]
+            b = b.index_add(0, self._handle_rows, pull - held)
+        return phi.index_add(0, constraints.free, self._inverse(b))
 
     def _scattered(
         self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None

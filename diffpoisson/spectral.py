@@ -8,7 +8,8 @@ zero.
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.linalg
@@ -19,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson.arguments import require_integer, to_tensor
+from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import laplacian
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.poisson import PoissonSolver
@@ -32,6 +34,7 @@ def laplacian_eigenpairs(
     *,
     mass: Mass = "barycentric",
     solver: PoissonSolver | None = None,
+    intrinsic_delaunay: bool = False,
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "n k"]]:
     """The smallest solutions of L φ = λ M φ, ascending, with φᵀMφ = I.
 
@@ -44,6 +47,7 @@ def laplacian_eigenpairs(
         mass: lumped mass M: thirds of the areas, or mixed Voronoi areas (Meyer et al. 2003), in
             units².
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+        intrinsic_delaunay: use that Laplacian, see `laplacian`; the mass stays that of the faces.
 
     Returns:
         eigenvalues (k,) in 1/units², eigenvectors (n, k) in 1/units (of tetrahedra, units^-3/2); in
@@ -67,6 +71,11 @@ def laplacian_eigenpairs(
             "laplacian_eigenpairs: the solver has pins, handles or face weights, so its matrix is "
             "not the Laplacian; pass one without"
         )
+    if solver is not None and intrinsic_delaunay:
+        raise ValueError(
+            "laplacian_eigenpairs: the solver has the Laplacian of the mesh's own faces, not of "
+            "its intrinsic Delaunay triangulation; leave it out"
+        )
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
     # Of total one, so that no scale is too large or small for ARPACK's tolerances.
     total = areas.sum()
@@ -74,10 +83,13 @@ def laplacian_eigenpairs(
     wanted = n_eigenpairs - zeros
     # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.
     if wanted > 0 and 2 * wanted + 1 < n - zeros:
-        solver = solver or PoissonSolver(mesh)
-        pairs = _lanczos(solver, areas, wanted)
+        if intrinsic_delaunay:
+            inverse = _pinned_inverse(mesh)
+        else:
+            inverse = (solver or PoissonSolver(mesh)).solve_laplacian
+        pairs = _lanczos(mesh, inverse, areas, wanted)
     else:
-        L = laplacian(mesh).toarray()
+        L = laplacian(mesh, intrinsic_delaunay=intrinsic_delaunay).toarray()
         pairs = scipy.linalg.eigh(L, np.diag(areas))
         pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
         if (pairs[0] <= 0).any():
@@ -99,10 +111,10 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         MeshError: Voronoi areas of tetrahedra.
     """
     require_mesh("lumped_mass", mesh)
+    if str(mass) not in get_args(Mass):
+        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures
-    if mass != "voronoi":
-        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     areas = mesh.areas.double()[:, None]
     shares = areas * _voronoi_shares(mesh.vertices.double()[mesh.faces])
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
@@ -117,6 +129,7 @@ def wave_kernel_signature(
     mass: Mass = "barycentric",
     scale_invariant: bool = True,
     solver: PoissonSolver | None = None,
+    intrinsic_delaunay: bool = False,
 ) -> Float[Tensor, "n e"]:
     """Wave-kernel signature of each vertex (Aubry et al. 2011, eq. 4).
 
@@ -133,12 +146,15 @@ def wave_kernel_signature(
         scale_invariant: multiply by the total area, which makes the signature dimensionless with
             average one; otherwise in 1/units².
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+        intrinsic_delaunay: use that Laplacian, see `laplacian`; the mass stays that of the faces.
 
     Raises:
         MeshError: too few vertices, or no two different non-zero eigenvalues, for this spectrum.
     """
     require_integer("wave_kernel_signature", "n_energies", n_energies, least=1)
-    values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
+    values, vectors = laplacian_eigenpairs(
+        mesh, n_eigenpairs, mass=mass, solver=solver, intrinsic_delaunay=intrinsic_delaunay
+    )
     log_values = values[mesh.n_components :].double().log()
     if len(log_values) < 2 or log_values[0] == log_values[-1]:
         raise MeshError(
@@ -164,6 +180,7 @@ def heat_kernel_signature(
     n_eigenpairs: int = 50,
     mass: Mass = "barycentric",
     solver: PoissonSolver | None = None,
+    intrinsic_delaunay: bool = False,
 ) -> Float[Tensor, "n t"]:
     """Heat-kernel signature of each vertex (Sun et al. 2009): Σₖ exp(-λₖ t) φₖ(x)², in 1/units².
 
@@ -173,6 +190,7 @@ def heat_kernel_signature(
         n_eigenpairs: size of the truncated spectrum, counting the zero eigenvalues.
         mass: see `laplacian_eigenpairs`.
         solver: a `PoissonSolver` of this mesh whose factor to use; made if omitted.
+        intrinsic_delaunay: use that Laplacian, see `laplacian`; the mass stays that of the faces.
 
     Raises:
         ValueError: negative times.
@@ -184,7 +202,9 @@ def heat_kernel_signature(
             "heat_kernel_signature: times must be (t,), finite and not negative, got shape "
             f"{tuple(times.shape)}"
         )
-    values, vectors = laplacian_eigenpairs(mesh, n_eigenpairs, mass=mass, solver=solver)
+    values, vectors = laplacian_eigenpairs(
+        mesh, n_eigenpairs, mass=mass, solver=solver, intrinsic_delaunay=intrinsic_delaunay
+    )
     return vectors**2 @ torch.exp(-values[:, None] * times.to(values)[None])
 
 
@@ -198,16 +218,32 @@ def _constants(mesh: Mesh, areas: np.ndarray) -> np.ndarray:
     return np.eye(len(totals))[labels] / np.sqrt(totals)
 
 
-def _lanczos(solver: PoissonSolver, areas: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _pinned_inverse(mesh: Mesh) -> Callable[[Tensor], Tensor]:
+    """Solves with the intrinsic Delaunay Laplacian, one vertex of each component at zero."""
+    _, anchors = np.unique(mesh.components.cpu().numpy(), return_index=True)
+    free = np.setdiff1d(np.arange(mesh.n_vertices), anchors)
+    factor = CholeskyFactor(laplacian(mesh, intrinsic_delaunay=True)[free][:, free])
+
+    def solve(b: Tensor) -> Tensor:
+        x = torch.zeros_like(b)
+        x[free] = factor.multiply(b[free])
+        return x
+
+    return solve
+
+
+def _lanczos(
+    mesh: Mesh, inverse: Callable[[Tensor], Tensor], areas: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The k smallest non-zero eigenpairs by shift-invert Lanczos at zero, ascending."""
-    n = solver.mesh.n_vertices
-    null = _constants(solver.mesh, areas)
+    n = mesh.n_vertices
+    null = _constants(mesh, areas)
 
     def pseudo_inverse(b: np.ndarray) -> np.ndarray:
         # Drop the part outside the range of L, solve with one vertex per component at zero, and
         # move the solution to mean zero: both projections together keep the operator symmetric.
         b = b - areas * (null @ (null.T @ b))
-        x = solver.solve_laplacian(torch.from_numpy(b)[:, None]).numpy()[:, 0]
+        x = inverse(torch.from_numpy(b)[:, None]).numpy()[:, 0]
         return x - null @ (null.T @ (areas * x))
 
     start = np.random.default_rng(0).standard_normal(n)  # ARPACK's own start is not reproducible

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffpoisson as dp
@@ -69,6 +69,7 @@ def test_geometry_gradient_on_random_meshes(drawn):
 CONNECTED = {k: v for k, v in testing.TOPOLOGIES.items() if "parts" not in k}
 
 
+@settings(max_examples=10)
 @given(testing.meshes(CONNECTED, max_log_scale=2))
 def test_equivariance(mesh):
     """A pinned map turns, moves and grows with the mesh, if the field turns with it."""
@@ -91,6 +92,7 @@ def test_equivariance(mesh):
     )
 
 
+@settings(max_examples=10)
 @given(testing.meshes(testing.TOPOLOGIES, max_log_scale=2))
 def test_invariance(mesh):
     """Of a map of any mesh with a constant field, to what does not turn the mesh."""

@@ -113,7 +113,7 @@ def test_models_are_imported_on_demand_only():
     """The core does not pull in what training needs."""
     code = (
         "import sys, diffpoisson; print([m for m in ('lightning', 'trimesh', 'njf_models', "
-        "'matplotlib') if m in sys.modules])"
+        "'matplotlib', 'hypothesis') if m in sys.modules])"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout == "[]\n"

@@ -1,0 +1,131 @@
+"""Arguments of the wrong kind: messages name the operation, the argument and the remedy."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import diffpoisson as dp
+from diffpoisson import arguments
+from tests import meshes
+
+pytestmark = pytest.mark.usefixtures("unchecked")
+CPU = torch.device("cpu")
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "message"),
+    [
+        (np.zeros(3), TypeError, "f: x must be a torch tensor, got ndarray; convert it with torch"),
+        (None, TypeError, "f: x must be a torch tensor, got NoneType"),
+        (torch.zeros(3, dtype=torch.int64), TypeError, "a real floating dtype, got torch.int64"),
+        (torch.zeros(3, dtype=torch.complex64), TypeError, "floating dtype, got torch.complex64"),
+        (torch.zeros(3, 3).to_sparse(), TypeError, "f: x must be dense, got torch.sparse_coo"),
+        (torch.zeros(3, device="meta"), ValueError, "f: x is on meta, the mesh on cpu"),
+    ],
+)
+def test_tensors(value, kind, message):
+    with pytest.raises(kind, match=re.escape(message)):
+        arguments.require_tensor("f", "x", value, CPU)
+    arguments.require_tensor("f", "x", torch.zeros(3).half(), CPU)
+    arguments.require_tensor("f", "x", torch.zeros(3, device="meta"))
+
+
+def test_single_or_double():
+    for dtype in (torch.float32, torch.float64):
+        arguments.require_single_or_double("f", "x", torch.zeros(1, dtype=dtype))
+    with pytest.raises(TypeError, match=r"f: x must be float32 or float64, got torch\.bfloat16"):
+        arguments.require_single_or_double("f", "x", torch.zeros(1).bfloat16())
+
+
+@pytest.mark.parametrize("value", ["a", object(), 1j, torch.zeros(2, 2).to_sparse(), [[1], [1, 2]]])
+def test_not_numeric(value):
+    with pytest.raises(TypeError, match="f: x must be "):
+        arguments.to_tensor("f", "x", value, CPU)
+
+
+def test_arrays_that_torch_cannot_share():
+    array = np.arange(3)
+    array.flags.writeable = False
+    assert arguments.to_tensor("f", "x", array, CPU).tolist() == [0, 1, 2]
+    assert arguments.to_tensor("f", "x", array[::-1], CPU).tolist() == [2, 1, 0]
+
+
+def test_integers():
+    arguments.require_integer("f", "k", np.int32(2), least=2)
+    arguments.require_integer("f", "k", -5)
+    for value in (2.0, "2", None, True):
+        with pytest.raises(TypeError, match=f"f: k must be an integer, got {type(value).__name__}"):
+            arguments.require_integer("f", "k", value)
+    with pytest.raises(ValueError, match="f: k must be at least 2, got 1"):
+        arguments.require_integer("f", "k", 1, least=2)
+
+
+def test_numbers():
+    for value in (0, 0.0, 1e300, np.float32(2)):
+        arguments.require_number("f", "a", value)
+    for value in (-1, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match=f"finite and not negative, got {value}"):
+            arguments.require_number("f", "a", value)
+    with pytest.raises(TypeError, match="f: a must be a number, got str"):
+        arguments.require_number("f", "a", "1")
+
+
+def test_instances():
+    arguments.require_instances("f", [1, 2], int)
+    with pytest.raises(TypeError, match="f: expected a list of int, got int"):
+        arguments.require_instances("f", 1, int)
+    with pytest.raises(TypeError, match="f: expected a list of int, but entry 1 is of type str"):
+        arguments.require_instances("f", [1, "a"], int)
+
+
+@pytest.mark.parametrize(
+    ("name", "others"),
+    {
+        "jacobians": (torch.zeros(3, 3),),
+        "divergence": (torch.zeros(1, 3, 2),),
+        "laplacian": (),
+        "PoissonSolver": (),
+        "laplacian_eigenpairs": (3,),
+        "heat_kernel_signature": (torch.ones(1),),
+        "lumped_mass": (),
+        "sample_surface": (3,),
+        "tutte": (),
+        "slim": (torch.zeros(3, 2),),
+    }.items(),
+)
+def test_another_library_s_mesh(name, others):
+    import trimesh
+
+    with pytest.raises(TypeError, match=f"{name}: expected a diffpoisson.Mesh, got Trimesh"):
+        getattr(dp, name)(trimesh.creation.box(), *others)
+
+
+def test_refinements():
+    """They change nothing but roundings, under constraints too, and raise with moving geometry."""
+    mesh = dp.Mesh(*meshes.parts())
+    R = torch.randn(mesh.n_faces, 3, 3, dtype=torch.float64)
+    pins, handles = torch.tensor([1, 4]), torch.tensor([30])
+    solver = dp.PoissonSolver(mesh, pins=pins, handles=handles, handle_weights=3.0)
+    images = {"pins": torch.randn(2, 3).double(), "handles": torch.randn(1, 3).double()}
+    for given in (R, torch.stack([R, 2 * R])):
+        expected = solver(given, **images)
+        torch.testing.assert_close(solver(given, **images, refinements=2), expected)
+    with pytest.raises(ValueError, match="refinements know the mesh's own geometry only"):
+        solver(R, **images, vertices=mesh.vertices, refinements=1)
+    with pytest.raises(ValueError, match="refinements must be at least 0, got -1"):
+        solver(R, **images, refinements=-1)
+
+
+@pytest.mark.parametrize("name", ["needles", "caps", "one_sliver"])
+def test_refinements_restore_digits(name):
+    """On faces of aspect ratio 10,000, against sixty-digit arithmetic."""
+    from tests.benchmarks import conditioning
+
+    record = conditioning.measure(*conditioning.SHAPES[name](1e4))
+    plain, refined = record["random"]["map"], record["random, refined"]["map"]
+    assert plain < 1e-5
+    assert refined < min(1e-10, plain / 100)

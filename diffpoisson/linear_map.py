@@ -211,7 +211,7 @@ def _summed(
 ) -> Float[Tensor, "n c"]:
     """Σₑ Pₑᵀ valuesₑ."""
     total = values.new_zeros(n + 1, values.shape[2])
-    return total.index_add(0, cells.flatten(), values.flatten(0, 1))[:n]
+    return total.index_add(0, cells.flatten(), values.reshape(-1, values.shape[2]))[:n]
 
 
 # ------------------------------------------------------- registration

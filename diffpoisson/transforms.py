@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar, overload
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import get_proxy_mode
 
 T = TypeVar("T")
 
@@ -59,9 +60,14 @@ def is_transformed(value: Tensor) -> bool:
     return bool(torch._C._functorch.is_functorch_wrapped_tensor(value))
 
 
+def is_tracing() -> bool:
+    """Whether operations are being recorded, so that values are not known: compile, linearize."""
+    return torch.compiler.is_compiling() or get_proxy_mode() is not None
+
+
 def concrete(value: Tensor) -> Tensor | None:
     """The values of a tensor under whatever transforms; None while compiling, or under vmap."""
-    if torch.compiler.is_compiling():
+    if is_tracing():
         return None
     while is_transformed(value):
         if torch._C._functorch.is_batchedtensor(value):
@@ -81,10 +87,10 @@ def require_equal(value: Tensor, expected: Tensor, message: str) -> None:
     """Raise unless a tensor, under whatever transforms, has the expected values.
 
     Raises:
-        ValueError: other values, or a batch of them under vmap. Compiled, where values are not
+        ValueError: other values, or a batch of them under vmap. Traced, where values are not
             known while tracing, a RuntimeError with the same message when it runs.
     """
-    if torch.compiler.is_compiling():
+    if is_tracing():
         torch._assert_async((value.detach() == expected).all(), message)
         return
     known = concrete(value)

@@ -315,3 +315,8 @@ def test_eigenvalues_that_rounding_hides_raise():
         assert "thin" in str(error)  # noqa: PT017 - either ending is right
     else:
         assert (values[1:] > 0).all()
+
+
+def test_two_eigenvalues_are_enough_for_a_signature():
+    signature = dp.wave_kernel_signature(dp.Mesh(*meshes.disk()), n_eigenpairs=3)
+    assert signature.isfinite().all()

@@ -443,4 +443,8 @@ def unsigned_singular_values(patch):
 @fault("distortion_of_volumes")
 def planar_cofactors(patch):
     """‖cof J‖ = ‖J‖, which holds for surfaces only."""
-    wrap(patch, distortion, "_squared_cofactors", lambda f, J: distortion._squared_norm(J))
+
+    def planar(original, J, chi):
+        return distortion._squared_norm(J / chi[..., None, None])
+
+    wrap(patch, distortion, "_squared_inverse", planar)

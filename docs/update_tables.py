@@ -65,7 +65,22 @@ def transforms_cell(result: dict) -> str:
     return {"correct": "✓", "raises": "raises"}[result["outcome"]]
 
 
-TABLES = {"uv_train": uv_train, "transforms": transforms}
+def poisson_cost() -> str:
+    """Seconds of the Poisson layer over mesh sizes."""
+    rows = json.loads((RESULTS / "poisson_cost.json").read_text())["rows"]
+    columns = ("vertices", "mesh_and_factor", "solve", "solve_and_backward")
+    head = (
+        "| vertices | mesh, operators and factor | solve | solve and backward |\n|---|---|---|---|"
+    )
+    body = (
+        "| " + " | ".join(f"{row[column]:.3g}" for column in columns[1:]) + " |" for row in rows
+    )
+    return "\n".join(
+        [head, *(f"| {r['vertices']:,} {line}" for r, line in zip(rows, body, strict=True))]
+    )
+
+
+TABLES = {"uv_train": uv_train, "transforms": transforms, "poisson_cost": poisson_cost}
 
 
 def number(value: float | None) -> str:

@@ -204,43 +204,30 @@ class PoissonSolver:
         require_integer("PoissonSolver", "refinements", refinements, least=0)
         geometry = self._moving_geometry(vertices, face_weights)
         frames = self._frames if geometry is None else geometry.frames
-        intrinsic = as_intrinsic("PoissonSolver", self.mesh, R.double(), frames)
-        batch, c = intrinsic.shape[:-3], intrinsic.shape[-2]
-        if transforms is not None:
-            _require_shape(
-                "transforms", transforms, batch, (self.mesh.n_faces, c, c), self.mesh.device
-            )
-            intrinsic = transforms.double() @ intrinsic
-        constraints = self.constraints
-        q_pins = self._given("pins", pins, len(constraints.pins), batch, c)
-        q_handles = self._given("handles", handles, len(constraints.handles), batch, c)
-        pull = None
-        if q_handles is not None:
-            pull = constraints.handle_weights[:, None] * q_handles
+        fields = self._transformed(
+            as_intrinsic("PoissonSolver", self.mesh, R.double(), frames), transforms
+        )
+        batch, c = fields.shape[:-3], fields.shape[-2]
+        q_pins = self._given("pins", pins, len(self.constraints.pins), batch, c)
+        pull = self._given("handles", handles, len(self.constraints.handles), batch, c)
+        if pull is not None:
+            pull = self.constraints.handle_weights[:, None] * pull
 
+        means = self._mean_weights
         if geometry is None:
-            b = self._divergence(matrices_to_columns(intrinsic))
-            if q_pins is not None:
-                b = b - self._coupling(q_pins)
-            if pull is not None:
-                b = b.index_add(0, self._handle_rows, pull)
-            x = self._inverse(b)
-            means = self._mean_weights
-        else:
-            weights = constraints.face_weights if face_weights is None else face_weights.double()
-            b = self._right_hand_side(geometry, weights, intrinsic, q_pins, pull)
-            x = self._moving_inverse(geometry.stiffness(weights), b)
-            means = constraints.mean_weights(geometry.vertex_measures())
-        phi = self._scattered(x, q_pins)
-        if refinements and geometry is not None:
+            phi = self._fitted(fields, q_pins, pull)
+            for _ in range(refinements):
+                phi = self._refined(phi, fields, pull)
+        elif refinements:
             raise ValueError(
                 "PoissonSolver: refinements know the mesh's own geometry only; leave them out "
                 "where derivatives by vertices or face_weights are wanted"
             )
-        for _ in range(refinements):
-            phi = self._refined(phi, intrinsic, pull)
+        else:
+            phi = self._fitted_moving(geometry, face_weights, fields, q_pins, pull)
+            means = self.constraints.mean_weights(geometry.vertex_measures())
         phi = self._placed(phi, means, translations, batch, c)
-        return columns_to_vertices(phi, intrinsic.shape).to(R.dtype)
+        return columns_to_vertices(phi, fields.shape).to(R.dtype)
 
     def solve_laplacian(self, b: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
         """The solution of L x = b that is zero at pins and at each component's anchor.
@@ -258,6 +245,30 @@ class PoissonSolver:
         return self._scattered(self._inverse(b[self.constraints.free].double())).to(b.dtype)
 
     # ---------------------------------------------------------------- steps of a solve
+
+    def _transformed(
+        self, fields: Float[Tensor, "*batch m c d"], transforms: Tensor | None
+    ) -> Float[Tensor, "*batch m c d"]:
+        """The matrices multiplied from the left."""
+        if transforms is None:
+            return fields
+        m, c = fields.shape[-3:-1]
+        _require_shape("transforms", transforms, fields.shape[:-3], (m, c, c), self.mesh.device)
+        return transforms.double() @ fields
+
+    def _fitted(
+        self,
+        fields: Float[Tensor, "*batch m c d"],
+        q_pins: Float[Tensor, "p k"] | None,
+        pull: Float[Tensor, "h k"] | None,
+    ) -> Float[Tensor, "n k"]:
+        """The solution before its floating components are placed."""
+        b = self._divergence(matrices_to_columns(fields))
+        if q_pins is not None:
+            b = b - self._coupling(q_pins)
+        if pull is not None:
+            b = b.index_add(0, self._handle_rows, pull)
+        return self._scattered(self._inverse(b), q_pins)
 
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
@@ -342,24 +353,26 @@ class PoissonSolver:
                 )
         return CellGeometry.at(self.mesh, self.mesh.vertices if vertices is None else vertices)
 
-    def _right_hand_side(
+    def _fitted_moving(
         self,
         geometry: CellGeometry,
-        weights: Float[Tensor, "m"],
-        R: Float[Tensor, "*batch m c d"],
+        face_weights: Float[Tensor, "m"] | None,
+        fields: Float[Tensor, "*batch m c d"],
         q_pins: Float[Tensor, "p k"] | None,
         pull: Float[Tensor, "h k"] | None,
-    ) -> Float[Tensor, "f k"]:
-        """∇ᵀA (R - ∇Φ) + W q at the free vertices, where Φ is zero but at the pins."""
+    ) -> Float[Tensor, "n k"]:
+        """As `_fitted`, and a function of the geometry and the face weights too."""
         constraints = self.constraints
-        if q_pins is not None:
+        weights = constraints.face_weights if face_weights is None else face_weights.double()
+        if q_pins is not None:  # the free vertices answer for what the pins alone leave of the fit
             held = q_pins.new_zeros(self.mesh.n_vertices, q_pins.shape[1])
             held = held.index_copy(0, constraints.pins, q_pins)
-            R = R - geometry.gradient(columns_to_vertices(held, R.shape))
-        b = vertices_to_columns(geometry.divergence(R, weights))
+            fields = fields - geometry.gradient(columns_to_vertices(held, fields.shape))
+        b = vertices_to_columns(geometry.divergence(fields, weights))
         if pull is not None:
             b = b.index_add(0, constraints.handles, pull)
-        return b[constraints.free]
+        x = self._moving_inverse(geometry.stiffness(weights), b[constraints.free])
+        return self._scattered(x, q_pins)
 
     def __repr__(self) -> str:
         constraints = self.constraints

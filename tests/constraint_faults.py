@@ -370,35 +370,35 @@ def constant_gauge(patch):
     )
 
 
-def change_right_hand_side(patch, change):
+def change_moving_fit(patch, change):
     """Change (geometry, weights, R, images of pins, pull of handles)."""
 
-    def right_hand_side(original, self, *args):
+    def fitted(original, self, *args):
         return original(self, *change(self, *args))
 
-    wrap_method(patch, Solver, "_right_hand_side", right_hand_side)
+    wrap_method(patch, Solver, "_fitted_moving", fitted)
 
 
 @fault("geometry_changes_no_value")
 def handles_do_not_pull_a_moving_mesh(patch):
     """The right-hand side for a moving geometry has no handles."""
-    change_right_hand_side(patch, lambda self, *args: (*args[:-1], None))
+    change_moving_fit(patch, lambda self, *args: (*args[:-1], None))
 
 
 @fault("geometry_changes_no_value")
 def pins_do_not_pull_a_moving_mesh(patch):
     """The right-hand side for a moving geometry has no pins."""
-    change_right_hand_side(patch, lambda self, *args: (*args[:3], None, args[4]))
+    change_moving_fit(patch, lambda self, *args: (*args[:3], None, args[4]))
 
 
 @fault("geometry_gradient")
 def constant_face_weights(patch):
-    """Face weights are taken as constants in the right-hand side."""
+    """Face weights are taken as constants in the fit by a moving geometry."""
 
     def change(self, geometry, weights, *rest):
         return geometry, self.constraints.face_weights, *rest
 
-    change_right_hand_side(patch, change)
+    change_moving_fit(patch, change)
 
 
 # ------------------------------------------------------- tetrahedra and their distortion

@@ -138,3 +138,17 @@ def test_derivatives(kind, name):
     }[name]
     assert gradcheck(function, x)
     assert gradgradcheck(function, x, rtol=1e-3, atol=1e-4)
+
+
+def test_thinness_is_least_height_over_longest_edge():
+    triangle = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0.5, 3**0.5 / 2, 0]]]).double()
+    needle = torch.tensor([[[0.0, 0, 0], [4, 0, 0], [1, 0, 0.02]]]).double()
+    corner = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]]).double()
+    for cell, expected in (
+        (triangle, 3**0.5 / 2),
+        (needle, 0.02 / 4),
+        (needle[..., [0, 2]], 0.02 / 4),
+        (corner, 1 / 3**0.5 / 2**0.5),  # over the face that is no coordinate plane
+    ):
+        for scale in (1e-6, 1.0, 1e6):
+            assert float(cells.thinness(scale * cell)) == pytest.approx(expected, rel=1e-6)

@@ -412,3 +412,17 @@ def test_a_number_is_not_rounded(unchecked):
         exact = torch.full((2,), 0.7, dtype=torch.float64)
         expected = dp.PoissonSolver(mesh, handles=handles, handle_weights=exact)
         assert torch.equal(given(R, handles=q), expected(R, handles=q))
+
+
+@pytest.mark.parametrize("weight", [2.0, 0.5])
+def test_uniform_face_weights_count_against_handles(weight):
+    """Face weights w and handles of strength w a are faces without weights and handles a."""
+    mesh = dp.Mesh(*meshes.disk())
+    R, targets = field(mesh), torch.eye(3, dtype=torch.float64)[:2]
+    handles = torch.tensor([3, 7])
+    plain = dp.PoissonSolver(mesh, handles=handles, handle_weights=0.3)
+    weights = torch.full((mesh.n_faces,), weight, dtype=torch.float64)
+    scaled = dp.PoissonSolver(
+        mesh, handles=handles, handle_weights=0.3 * weight, face_weights=weights
+    )
+    assert_near(scaled(R, handles=targets), plain(R, handles=targets), SOLVE)

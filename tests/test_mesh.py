@@ -497,3 +497,9 @@ def test_concatenate_rejects_what_does_not_go_together():
         dp.Mesh.concatenate([mesh, mesh.to(torch.float32)])
     with pytest.raises(dp.MeshError, match="must agree in dimension"):
         dp.Mesh.concatenate([mesh, dp.Mesh(*meshes.planar_disk())])
+
+
+def test_boundary_that_touches_itself_is_named():
+    mesh = dp.Mesh(*meshes.bowtie())
+    with pytest.raises(dp.MeshError, match=r"passes 1 vertex \[0\] more than once"):
+        _ = mesh.boundary_loops

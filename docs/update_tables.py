@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 
 DOCS = Path(__file__).parent
@@ -80,7 +81,28 @@ def poisson_cost() -> str:
     )
 
 
-TABLES = {"uv_train": uv_train, "transforms": transforms, "poisson_cost": poisson_cost}
+def mutations() -> str:
+    """Mutants of each file: how many there are, how many were run, and what came of them."""
+    result = json.loads((RESULTS / "mutations.json").read_text())
+    counts = Counter((mutant["file"], mutant["outcome"]) for mutant in result["mutants"])
+    files = sorted({file for file, _ in counts})
+    columns = [(file, counts[file, "killed"], counts[file, "survived"]) for file in files]
+    rows = [
+        f"| `{file}.py` | {result['population'].get(file, '–')} | {killed + survived} | {killed} "
+        f"| {survived} |"
+        for file, killed, survived in columns
+    ]
+    killed, survived = (sum(column[k] for column in columns) for k in (1, 2))
+    head = "| file | mutants | run | killed | survived |\n|---|---|---|---|---|"
+    return "\n".join([head, *rows, f"| all | | {killed + survived} | {killed} | {survived} |"])
+
+
+TABLES = {
+    "uv_train": uv_train,
+    "transforms": transforms,
+    "poisson_cost": poisson_cost,
+    "mutations": mutations,
+}
 
 
 def number(value: float | None) -> str:

@@ -213,7 +213,8 @@ def main() -> None:
     totals = {name: sum(m[0] == name for m in population) for name in sources}
     done: list[dict[str, Any]] = []
     if arguments.json and arguments.json.exists():
-        done = json.loads(arguments.json.read_text())["mutants"]
+        earlier = json.loads(arguments.json.read_text())
+        done, totals = earlier["mutants"], earlier["population"] | totals
     known = {(r["file"], r["line"], r["change"]) for r in done}
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:

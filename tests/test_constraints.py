@@ -426,3 +426,13 @@ def test_uniform_face_weights_count_against_handles(weight):
         mesh, handles=handles, handle_weights=0.3 * weight, face_weights=weights
     )
     assert_near(scaled(R, handles=targets), plain(R, handles=targets), SOLVE)
+
+
+def test_editing_a_gauge_mask_afterwards_changes_nothing():
+    mesh = dp.Mesh(*meshes.disk())
+    mask = torch.arange(mesh.n_vertices) < 4
+    solver, R = dp.PoissonSolver(mesh, gauge=mask), field(mesh)
+    expected = solver(R)
+    mask[:] = True
+    assert torch.equal(solver(R), expected)
+    assert_near(solver.update(mesh.vertices)(R), expected, SOLVE)

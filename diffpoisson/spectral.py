@@ -64,39 +64,22 @@ def laplacian_eigenpairs(
         raise MeshError(
             f"laplacian_eigenpairs: a mesh of {n} vertices has {n} eigenpairs, not {n_eigenpairs}"
         )
-    if solver is not None and solver.mesh is not mesh:
-        raise ValueError("laplacian_eigenpairs: the solver belongs to another mesh; pass its own")
-    if solver is not None and not solver.constraints.natural:
-        raise ValueError(
-            "laplacian_eigenpairs: the solver has pins, handles or face weights, so its matrix is "
-            "not the Laplacian; pass one without"
-        )
-    if solver is not None and intrinsic_delaunay:
-        raise ValueError(
-            "laplacian_eigenpairs: the solver has the Laplacian of the mesh's own faces, not of "
-            "its intrinsic Delaunay triangulation; leave it out"
-        )
+    _check_solver(mesh, solver, intrinsic_delaunay)
     areas = lumped_mass(mesh, mass).double().cpu().numpy()
     # Of total one, so that no scale is too large or small for ARPACK's tolerances.
     total = areas.sum()
     areas = areas / total
     wanted = n_eigenpairs - zeros
-    # Lanczos keeps 2k + 1 vectors; where that approaches n, the dense solver is exact and faster.
-    if wanted > 0 and 2 * wanted + 1 < n - zeros:
+    if wanted <= 0:
+        pairs = (np.zeros(0), np.zeros((n, 0)))
+    elif 2 * wanted + 1 < n - zeros:
         if intrinsic_delaunay:
             inverse = _pinned_inverse(mesh)
         else:
             inverse = (solver or PoissonSolver(mesh)).solve_laplacian
         pairs = _lanczos(mesh, inverse, areas, wanted)
-    else:
-        L = laplacian(mesh, intrinsic_delaunay=intrinsic_delaunay).toarray()
-        pairs = scipy.linalg.eigh(L, np.diag(areas))
-        pairs = (pairs[0][zeros:], pairs[1][:, zeros:])
-        if (pairs[0] <= 0).any():
-            raise MeshError(
-                "laplacian_eigenpairs: rounding hides the smallest eigenvalues behind the largest, "
-                "that of the thinnest faces; remesh these"
-            )
+    else:  # Lanczos keeps 2k + 1 vectors; near n, the dense solver is exact and faster
+        pairs = _dense(laplacian(mesh, intrinsic_delaunay=intrinsic_delaunay), areas, zeros)
     values = np.concatenate([np.zeros(zeros), pairs[0]])[:n_eigenpairs]
     vectors = np.concatenate([_constants(mesh, areas), pairs[1]], axis=1)[:, :n_eigenpairs]
     values, vectors = values / total, vectors / np.sqrt(total)
@@ -209,6 +192,35 @@ def heat_kernel_signature(
 
 
 # -------------------------------------------------------------------- eigenproblem
+
+
+def _check_solver(mesh: Mesh, solver: PoissonSolver | None, intrinsic_delaunay: bool) -> None:
+    """Raise unless a given solver's factor is that of the Laplacian in question."""
+    if solver is None:
+        return
+    if solver.mesh is not mesh:
+        raise ValueError("laplacian_eigenpairs: the solver belongs to another mesh; pass its own")
+    if not solver.constraints.natural:
+        raise ValueError(
+            "laplacian_eigenpairs: the solver has pins, handles or face weights, so its matrix is "
+            "not the Laplacian; pass one without"
+        )
+    if intrinsic_delaunay:
+        raise ValueError(
+            "laplacian_eigenpairs: the solver has the Laplacian of the mesh's own faces, not of "
+            "its intrinsic Delaunay triangulation; leave it out"
+        )
+
+
+def _dense(L: sp.csr_matrix, areas: np.ndarray, zeros: int) -> tuple[np.ndarray, np.ndarray]:
+    """All non-zero eigenpairs, ascending."""
+    values, vectors = scipy.linalg.eigh(L.toarray(), np.diag(areas))
+    if (values[zeros:] <= 0).any():
+        raise MeshError(
+            "laplacian_eigenpairs: rounding hides the smallest eigenvalues behind the largest, "
+            "that of the thinnest faces; remesh these"
+        )
+    return values[zeros:], vectors[:, zeros:]
 
 
 def _constants(mesh: Mesh, areas: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ import torch
 import trimesh
 
 import diffpoisson as dp
+from diffpoisson import spectral
 from tests import meshes, references
 from tests.checks import SOLVE, assert_near
 
@@ -320,3 +321,16 @@ def test_eigenvalues_that_rounding_hides_raise():
 def test_two_eigenvalues_are_enough_for_a_signature():
     signature = dp.wave_kernel_signature(dp.Mesh(*meshes.disk()), n_eigenpairs=3)
     assert signature.isfinite().all()
+
+
+def test_no_more_pairs_than_components_are_the_constants_at_no_cost(monkeypatch):
+    """Neither a factor nor a dense matrix is made for eigenvalue zero."""
+    mesh = dp.Mesh(*meshes.parts())
+    monkeypatch.setattr(spectral, "laplacian", None)
+    monkeypatch.setattr(spectral, "PoissonSolver", None)
+    values, vectors = dp.laplacian_eigenpairs(mesh, 2)
+    assert values.tolist() == [0, 0]
+    gram = vectors.T @ (mesh.vertex_areas[:, None] * vectors)
+    assert (gram - torch.eye(2, dtype=gram.dtype)).abs().max() < 1e-12
+    for label in range(mesh.n_components):
+        assert (vectors[mesh.components == label].std(dim=0) < 1e-12).all()

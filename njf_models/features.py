@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -53,6 +54,64 @@ def bounding_box_centre(mesh: dp.Mesh) -> Float[Tensor, "3"]:
     return (mesh.vertices.amin(dim=0) + mesh.vertices.amax(dim=0)) / 2
 
 
+class Motions(NamedTuple):
+    """A similarity for each of several parts, for augmentation.
+
+    Attributes:
+        turns: (parts, 3, 3) orthogonal matrices, rotations or reflections of the shape.
+        images: (parts, 2, 2) the matrices that turn its planar map along.
+        scales: (parts,) positive factors on lengths.
+    """
+
+    turns: Float[Tensor, "parts 3 3"]
+    images: Float[Tensor, "parts 2 2"]
+    scales: Float[Tensor, "parts"]
+
+    @classmethod
+    def random(
+        cls,
+        n: int,
+        *,
+        tilt: float = 0.1,
+        log_scale: float = 0.1,
+        generator: torch.Generator | None = None,
+    ) -> Motions:
+        """Any turn about z, mirrored half of the time, after a small turn about another axis.
+
+        Args:
+            n: number of parts.
+            tilt: standard deviation of each of the two small angles, in radians.
+            log_scale: standard deviation of the logarithm of the scale.
+            generator: source of randomness; torch's global one if omitted.
+        """
+        angle = 2 * torch.pi * torch.rand(n, generator=generator)
+        mirror = torch.randint(2, (n,), generator=generator) * 2.0 - 1
+        small = tilt * torch.randn(n, 2, generator=generator)
+        scales = (log_scale * torch.randn(n, generator=generator)).exp()
+        zero = torch.zeros(n)
+        cos, sin = angle.cos(), angle.sin()
+        images = torch.stack([cos, -sin * mirror, sin, cos * mirror], dim=-1).view(n, 2, 2)
+        turns = torch.eye(3).repeat(n, 1, 1)
+        turns[:, :2, :2] = images
+        # exp of the cross product with (a, b, 0): a rotation about an axis in the plane.
+        a, b = small.unbind(-1)
+        cross = torch.stack([zero, zero, b, zero, zero, -a, -b, a, zero], dim=-1).view(n, 3, 3)
+        return cls(turns @ torch.linalg.matrix_exp(cross), images, scales)
+
+    def points(self, points: Float[Tensor, "parts s f"]) -> Float[Tensor, "parts s f"]:
+        """Point features of the parts, moved."""
+        return _moved_features(
+            points, self.turns.to(points.dtype)[:, None], self.scales.to(points.dtype)[:, None]
+        )
+
+
+def _moved_features(features: Tensor, turns: Tensor, scales: Tensor) -> Tensor:
+    """Position and normal, the first six columns, turned; the rest knows no pose."""
+    position, normal, rest = features.split([3, 3, features.shape[-1] - 6], dim=-1)
+    position = scales[..., None] * (turns @ position[..., None])[..., 0]
+    return torch.cat([position, (turns @ normal[..., None])[..., 0], rest], dim=-1)
+
+
 def reference_wks(mesh: dp.Mesh, solver: dp.PoissonSolver) -> Float[Tensor, "n 100"]:
     """Wave-kernel signature with the constants of the authors' experiments, for their checkpoints.
 
@@ -72,11 +131,14 @@ class Shape:
         mesh: the surface, or the disjoint union of several.
         solver: its Poisson solver.
         features: (m, f) centroid features in the network's dtype.
+        frames: (m, 3, 2) the faces' tangent bases in the pose that the features describe; the
+            operators are intrinsic and know no pose.
     """
 
     mesh: dp.Mesh
     solver: dp.PoissonSolver
     features: Float[Tensor, "m f"]
+    frames: Float[Tensor, "m 3 2"]
 
     @classmethod
     def prepare(
@@ -86,14 +148,15 @@ class Shape:
         dtype: torch.dtype = torch.float32,
     ) -> Shape:
         """Factorise the mesh's Laplacian and compute the features of its faces."""
-        return cls(mesh, dp.PoissonSolver(mesh), face_features(mesh, wks).to(dtype))
+        features = face_features(mesh, wks).to(dtype)
+        return cls(mesh, dp.PoissonSolver(mesh), features, mesh.frames.to(dtype))
 
     @classmethod
     def concatenate(cls, shapes: Sequence[Shape]) -> Shape:
         """The disjoint union as one batch, reusing the factors."""
         solver = dp.PoissonSolver.concatenate([shape.solver for shape in shapes])
         features = torch.cat([shape.features for shape in shapes])
-        return cls(solver.mesh, solver, features)
+        return cls(solver.mesh, solver, features, torch.cat([shape.frames for shape in shapes]))
 
     @cached_property
     def face_weights(self) -> Float[Tensor, "m"]:
@@ -104,6 +167,17 @@ class Shape:
     def vertex_weights(self) -> Float[Tensor, "n"]:
         """Area of each vertex as a share of its part's area, float64."""
         return _shares(self.mesh.vertex_areas.double(), self.mesh.part_of_vertex, self.mesh.n_parts)
+
+    def moved(self, motions: Motions) -> Shape:
+        """Each part as the network would see it turned and scaled.
+
+        Nothing intrinsic changes, so operators and factor stay. (A mirrored part counts as
+        reoriented too, so that its normals are the mirrored ones.)
+        """
+        turns = motions.turns.to(self.features.dtype)[self.mesh.part_of_face]
+        scales = motions.scales.to(self.features.dtype)[self.mesh.part_of_face]
+        features = _moved_features(self.features, turns, scales)
+        return replace(self, features=features, frames=turns @ self.frames)
 
     def with_features(self, features: Float[Tensor, "m f"]) -> Shape:
         """The same operators under other features."""

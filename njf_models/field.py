@@ -59,14 +59,14 @@ class FieldMLP(nn.Module):
 
     def forward(
         self,
-        features: Float[Tensor, "m f"],
+        features: Float[Tensor, "*#batch m f"],
         code: Float[Tensor, "*batch z"],
         part_of_face: Int[Tensor, "m"] | None = None,
     ) -> Float[Tensor, "*any out"]:
         """Outputs for every face.
 
         Args:
-            features: (m, f) features of the faces.
+            features: (m, f) features of the faces, or (…, m, f) with a code for each.
             code: (…, z), every code with every face, if `part_of_face` is None; else (parts, z),
                 one code for the faces of each part of a packed batch.
             part_of_face: (m,) the code that belongs to each face.
@@ -75,7 +75,7 @@ class FieldMLP(nn.Module):
             (…, m, out), or (m, out) if packed.
         """
         first = cast("nn.Linear", self.layers[0])
-        of_code, of_features = first.weight.split((self.code_size, features.shape[1]), dim=1)
+        of_code, of_features = first.weight.split((self.code_size, features.shape[-1]), dim=1)
         per_code = functional.linear(code, of_code, first.bias)
         per_code = per_code[..., None, :] if part_of_face is None else per_code[part_of_face]
         return self.layers[1:](per_code + functional.linear(features, of_features))

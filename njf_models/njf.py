@@ -1,4 +1,9 @@
-"""Neural Jacobian Fields (Aigerman et al. 2022): predict a matrix per face, then solve Poisson."""
+"""Neural Jacobian Fields (Aigerman et al. 2022): predict a matrix per face, then solve Poisson.
+
+The paper predicts once. With more rounds, a network reads the Jacobians of the solved map back and
+corrects them, and the map is solved again with the same factor: a learned alternation of a local
+and a global step, as in local/global optimisation of a distortion energy (Liu et al. 2008).
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import diffpoisson as dp
+from diffpoisson.arguments import require_integer
 from njf_models.features import Shape
 from njf_models.field import FieldMLP
 from njf_models.pointnet import PointNet
@@ -42,6 +48,8 @@ class NeuralJacobianField(nn.Module):
         parameters: number of user parameters appended to the code (a target pose, handle
             positions).
         output_dim: c, 3 for maps to space, 2 for maps to the plane.
+        rounds: number of predictions, each followed by a solve; 1 is the paper's network.
+        shared_rounds: whether all corrections have one network, or each its own.
         centering: whether the emitted map has area-weighted mean zero on each component (the
             paper), or its plain mean over vertices is zero (the authors' experiments).
         width: size of the field's hidden layers.
@@ -56,17 +64,25 @@ class NeuralJacobianField(nn.Module):
         code_size: int = 1000,
         parameters: int = 0,
         output_dim: int = 3,
+        rounds: int = 1,
+        shared_rounds: bool = False,
         centering: Centering = "area",
         width: int = 128,
     ) -> None:
         super().__init__()
         if centering not in ("area", "vertex"):
             raise ValueError(f"centering must be 'area' or 'vertex', got {centering!r}")
+        require_integer("NeuralJacobianField", "rounds", rounds, least=1)
         self.encodes_target, self.output_dim, self.centering = encodes_target, output_dim, centering
+        self.rounds, self.shared_rounds = rounds, shared_rounds
         self.encoder = PointNet(point_features, code_size) if point_features else None
         n_codes = (1 + encodes_target) if point_features else 0
-        self.field = FieldMLP(
-            n_codes * code_size + parameters, face_features, output_dim * 3, width
+        code_size = n_codes * code_size + parameters
+        entries = output_dim * 3
+        self.field = FieldMLP(code_size, face_features, entries, width)
+        self.corrections = nn.ModuleList(
+            FieldMLP(code_size, face_features + 2 * entries, entries, width)
+            for _ in range(min(rounds - 1, 1) if shared_rounds else rounds - 1)
         )
 
     def encode(
@@ -98,13 +114,17 @@ class NeuralJacobianField(nn.Module):
         return code
 
     def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
-        """The map of a shape for each code.
+        """The map of a shape for each code; that of the last round.
 
         Args:
             shape: one prepared shape, or several concatenated.
             code: (…, z) codes for one shape, or (parts, z) one code for each of the concatenated
                 shapes.
         """
+        return self.iterates(shape, code)[-1]
+
+    def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
+        """The maps after each round; arguments as for a call."""
         mesh = shape.mesh
         part_of_face = mesh.part_of_face if mesh.n_parts > 1 else None
         if part_of_face is not None and code.shape[:-1] != (mesh.n_parts,):
@@ -112,11 +132,35 @@ class NeuralJacobianField(nn.Module):
                 f"NeuralJacobianField: {mesh.n_parts} concatenated shapes need codes of shape "
                 f"({mesh.n_parts}, z), got {tuple(code.shape)}"
             )
-        outputs = self.field(shape.features, code, part_of_face)
-        offsets = outputs.unflatten(-1, (self.output_dim, 3))
-        P = offsets + torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
-        R = dp.restrict(P, mesh.frames)
+        offsets = self.field(shape.features, code, part_of_face)
+        identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
+        predictions = [self._solved(shape, identity + self._matrices(offsets))]
+        for k in range(self.rounds - 1):
+            correction = self.corrections[0 if self.shared_rounds else k]
+            J, seen = self._read_back(shape, predictions[-1])
+            offsets = correction(seen, code, part_of_face)
+            predictions.append(self._solved(shape, J + self._matrices(offsets)))
+        return predictions
+
+    def _matrices(self, outputs: Float[Tensor, "*any entries"]) -> Float[Tensor, "*any c 3"]:
+        return outputs.unflatten(-1, (self.output_dim, 3))
+
+    def _solved(self, shape: Shape, P: Float[Tensor, "*batch m c 3"]) -> Prediction:
+        R = dp.restrict(P, shape.frames)
         return Prediction(P, R, self._centred(shape, shape.solver(R)))
+
+    def _read_back(
+        self, shape: Shape, prediction: Prediction
+    ) -> tuple[Float[Tensor, "*batch m c 3"], Float[Tensor, "*batch m f"]]:
+        """Jacobians of the solved map, and what a correction sees: also what they miss of R.
+
+        On ambient vectors, where they do not depend on the frames.
+        """
+        J = dp.jacobians(shape.mesh, prediction.vertices)
+        missed = dp.extend(prediction.jacobians - J, shape.frames)
+        J = dp.extend(J, shape.frames)
+        features = shape.features.expand(*J.shape[:-2], -1)
+        return J, torch.cat([features, J.flatten(-2), missed.flatten(-2)], dim=-1)
 
     def _centred(
         self, shape: Shape, phi: Float[Tensor, "*batch n c"]

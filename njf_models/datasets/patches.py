@@ -281,5 +281,4 @@ def _clean_step(faces: np.ndarray) -> np.ndarray:
     if ear.any():
         return ~ear
     rim, passes = np.unique(edges.ends[edges.n_faces == 1], return_counts=True)
-    pinched: np.ndarray = np.isin(faces, rim[passes > 2]).any(axis=1)
-    return ~pinched
+    return np.asarray(~np.isin(faces, rim[passes > 2]).any(axis=1))

@@ -55,8 +55,8 @@ class UVStore(Sequence[UVPatch], Dataset[UVPatch]):
     """The patches of a store: a data set with random access, read from the disk one by one.
 
     Columns are in memory, in the order of the patches: `flatness`, `energy`, `iterations` of SLIM,
-    `index` (number of the patch on its mesh), `n_faces`, `n_vertices`, and the lists `mesh_name`
-    and `family`. A shard's checksum is verified when its first patch is read.
+    `index_on_mesh` (number of the patch on its mesh), `n_faces`, `n_vertices`, and the lists
+    `mesh_name` and `family`. A shard's checksum is verified when its first patch is read.
 
     Args:
         folder: of `build.build_store`.

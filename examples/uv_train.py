@@ -4,7 +4,8 @@ Meshes → disk patches → SLIM targets → split by mesh → training → eval
 default takes about ten minutes on two cores; `--full` trains until it no longer improves. Run it
 again after an interruption, and it goes on where it stopped: patches and checkpoints are kept.
 
-Writes to the folder `--out`: results.png, results.json, the training log and checkpoints.
+Writes to the folder `--out`: results.png, results.json, the patches, the training log and
+checkpoints.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ import lightning
 import numpy as np
 import torch
 
+from njf_models.datasets.build import StoreSettings, build_store
 from njf_models.datasets.patches import PatchOptions
 from njf_models.datasets.sources import CSGParts, DogBones, MeshFolder, RawMesh, Thingi10K
-from njf_models.datasets.uv import UVPatch, build_uv_patches, split_by_mesh
+from njf_models.datasets.store import UVStore, split_by_mesh
 from njf_models.evaluation import UVRecord, evaluate_uv, format_table, summarise
 from njf_models.report import UVRow, save_uv_report
 from njf_models.training import (
@@ -48,7 +50,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
     warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
 
-    patches, counts = collect_patches(options)
+    patches = collect_patches(options)
     train, validation, test = split_by_mesh(patches, SPLIT, seed=options.seed)
     print(f"{len(train)} training, {len(validation)} validation, {len(test)} test patches")
 
@@ -65,7 +67,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
         "options": {name: str(value) for name, value in vars(options).items()},
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
-        "draws": counts,
+        "draws": dict(patches.counts),
         "splits": {"train": names(train), "validation": names(validation), "test": names(test)},
         "training_seconds": seconds,
         "summary": table,
@@ -104,20 +106,20 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def collect_patches(options: argparse.Namespace) -> tuple[list[UVPatch], dict[str, int]]:
-    """Patches with their SLIM targets, from the cache where they have been made before."""
+def collect_patches(options: argparse.Namespace) -> UVStore:
+    """Patches with their SLIM targets; those that an earlier run has made are not made again."""
     sources: Iterable[RawMesh] = chain(DogBones(), CSGParts(options.csg, options.seed))
     if options.meshes is not None:
         sources = MeshFolder(options.meshes)
     elif options.thingi10k is not None:
         sources = islice(Thingi10K(), options.thingi10k)
-    meshes = list(sources)
-    print(f"{len(meshes)} meshes")
     smallest, largest = options.faces
     limits = PatchOptions(smallest, largest, min_flatness=options.min_flatness)
-    patches, counts = build_uv_patches(meshes, options.patches, seed=options.seed, options=limits)
-    print("patches drawn: " + ", ".join(f"{n} {reason}" for reason, n in counts.most_common()))
-    return patches, dict(counts)
+    settings = StoreSettings(limits, seed=options.seed)
+    store = build_store(options.out / "patches", sources, options.patches, settings)
+    draws = (f"{n} {reason}" for reason, n in store.counts.most_common())
+    print("patches drawn: " + ", ".join(draws))
+    return store
 
 
 def make_module(options: argparse.Namespace, n_wks: int) -> NJFTraining:
@@ -134,8 +136,8 @@ def make_module(options: argparse.Namespace, n_wks: int) -> NJFTraining:
 
 def fit(
     module: NJFTraining,
-    train: list[UVPatch],
-    validation: list[UVPatch],
+    train: UVStore,
+    validation: UVStore,
     options: argparse.Namespace,
 ) -> float:
     """Train, going on from the last checkpoint if there is one; the seconds it took."""
@@ -156,13 +158,13 @@ def fit(
     return time.perf_counter() - start
 
 
-def names(patches: list[UVPatch]) -> list[str]:
-    return sorted({patch.mesh_name for patch in patches})
+def names(patches: UVStore) -> list[str]:
+    return sorted(set(patches.mesh_name))
 
 
 def draw(
     out: Path,
-    test: list[UVPatch],
+    test: UVStore,
     maps: list[torch.Tensor],
     before: list[UVRecord],
     after: list[UVRecord],

@@ -1,3 +1,3 @@
-"""Data sets: mesh sources, the training pairs made of them, and the cache that keeps them."""
+"""Data sets: mesh sources, patches and their targets, and the store that keeps them."""
 
 from __future__ import annotations

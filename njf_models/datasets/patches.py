@@ -1,21 +1,21 @@
-"""Disk patches of a mesh: grown to a random geodesic radius, cleaned, kept if a disk, aligned.
+"""Disk patches of a mesh: the faces nearest to a random one, cleaned, kept if a disk, aligned.
 
-Geodesic distance is the shortest path through faces, from centroid to centroid by way of the
-midpoint of the shared edge. Alignment follows NJF: unit area, centred, mean normal along +z, then
-turned in the plane to the principal axes. The identity Jacobian then is the projection to the
-plane.
+Nearest is meant along the surface: the shortest path through faces, from centroid to centroid by
+way of the midpoint of the shared edge. Islands that a patch encloses belong to it. Alignment
+follows NJF: unit area, centred, mean normal along +z, then turned in the plane to the principal
+axes. The identity Jacobian then is the projection to the plane.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse import csgraph
 
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, MeshError
 
 
 class PatchRejectedError(Exception):
@@ -28,7 +28,7 @@ class PatchOptions:
 
     Attributes:
         min_faces: smallest patch, after cleaning.
-        max_faces: largest patch, before cleaning.
+        max_faces: largest patch.
         min_flatness: reject patches with |Σ nA| / ΣA below this (1 is flat); 0 keeps all.
         attempts: draws for one patch before giving up.
     """
@@ -44,20 +44,16 @@ class Patch:
     """A disk of unit area in the aligned pose.
 
     Attributes:
-        vertices: (n, 3) float64.
-        faces: (m, 3) int64.
+        mesh: the disk, its float64 vertices rounded to float32, as they are stored.
         flatness: |Σ nA| / ΣA, 1 where the patch is flat.
-        radius: geodesic radius it was grown to, in units of the patch.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: Mesh
     flatness: float
-    radius: float
 
 
 class PatchSampler:
-    """Grows random patches on one mesh.
+    """Grows random patches on one mesh; the graph of its faces is made once.
 
     Args:
         vertices: (n, 3) float64 positions.
@@ -68,44 +64,80 @@ class PatchSampler:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, options: PatchOptions) -> None:
         self.vertices, self.faces, self.options = vertices, faces, options
         self.graph = dual_graph(vertices, faces)
+        self.component = csgraph.connected_components(self.graph)[1]
+        self.component_sizes = np.bincount(self.component)
+        self.spacing = self.graph.data.mean() if self.graph.nnz else 0.0
 
     def sample(self, rng: np.random.Generator) -> Patch:
-        """One patch: uniform seed face, uniform radius among those that give an allowed size.
+        """One patch: uniform seed face, uniform size among those allowed.
 
         Raises:
             PatchRejectedError: this patch is not wanted; draw again.
         """
-        seed_face = rng.integers(len(self.faces))
-        distance = csgraph.dijkstra(self.graph, directed=False, indices=seed_face)
-        reachable = np.sort(distance[np.isfinite(distance)])
-        smallest, largest = self.options.min_faces, min(self.options.max_faces, len(reachable))
+        seed_face = int(rng.integers(len(self.faces)))
+        smallest, largest = self.options.min_faces, self.options.max_faces
+        largest = min(largest, int(self.component_sizes[self.component[seed_face]]))
         if largest < smallest:
             raise PatchRejectedError("component too small")
-        radius = rng.uniform(reachable[smallest - 1], reachable[largest - 1])
-        return self._cut(distance <= radius, float(radius))
+        return self._cut(self.nearest(seed_face, int(rng.integers(smallest, largest + 1))))
 
-    def _cut(self, inside: np.ndarray, radius: float) -> Patch:
-        """Clean, check and align the patch of the faces inside."""
-        kept = clean_boundary(self.faces[inside])
+    def nearest(self, seed_face: int, size: int) -> np.ndarray:
+        """(size,) the faces nearest to one, itself first; its component must have as many."""
+        # A disk of k even faces, two per cell of this spacing, is about √k spacings wide. Only
+        # the time depends on the guess.
+        limit = self.spacing * np.sqrt(size) + np.finfo(np.float64).tiny
+        while True:
+            distance = csgraph.dijkstra(self.graph, indices=seed_face, limit=limit)
+            reached = np.flatnonzero(np.isfinite(distance))
+            if len(reached) >= size:
+                return reached[np.argsort(distance[reached], kind="stable")[:size]]
+            limit *= 2
+
+    def _cut(self, chosen: np.ndarray) -> Patch:
+        """Clean, fill, check and align the patch of the faces chosen."""
+        kept = chosen[clean_boundary(self.faces[chosen])]
+        if len(kept) and defect(self.faces[kept]) == "has holes":
+            kept = np.concatenate([kept, self._enclosed(kept)])
+            kept = kept[clean_boundary(self.faces[kept])]
         if len(kept) < self.options.min_faces:
             raise PatchRejectedError("too few faces after cleaning")
-        mesh = Mesh.cleaned(self.vertices, kept).mesh
-        _require_disk(mesh)
-        vertices, flatness = align(mesh.vertices.numpy(), mesh.faces.numpy())
+        if (reason := defect(self.faces[kept])) is not None:
+            raise PatchRejectedError(reason)
+        used, faces = np.unique(self.faces[np.sort(kept)], return_inverse=True)
+        vertices, flatness = align(self.vertices[used], faces.reshape(-1, 3))
         if flatness < self.options.min_flatness:
             raise PatchRejectedError("not flat enough")
-        scale = math.sqrt(mesh.areas.sum())
-        return Patch(vertices, mesh.faces.numpy(), flatness, radius / scale)
+        mesh = rounded_mesh(vertices, faces.reshape(-1, 3))
+        if not mesh.is_disk:
+            raise PatchRejectedError("not manifold")
+        return Patch(mesh, flatness)
+
+    def _enclosed(self, kept: np.ndarray) -> np.ndarray:
+        """Faces of the islands around which a patch has grown, if there is room for all of them.
+
+        All parts of the component's rest are islands except the largest.
+        """
+        outside = self.component == self.component[kept[0]]
+        outside[kept] = False
+        rest = np.flatnonzero(outside)
+        if not len(rest):
+            return rest
+        part = csgraph.connected_components(self.graph[rest][:, rest])[1]
+        islands = rest[part != np.bincount(part).argmax()]
+        return islands if len(kept) + len(islands) <= self.options.max_faces else islands[:0]
 
 
 def dual_graph(vertices: np.ndarray, faces: np.ndarray) -> sp.csr_matrix:
     """(m, m) graph of the faces that share an edge with no third face, weighted by distance."""
-    f, g, i, j = _inner_edges(faces)
+    edges = _edges(faces)
+    f, g = edges.neighbours
+    i, j = edges.ends[edges.n_faces == 2].T
     midpoints = (vertices[i] + vertices[j]) / 2
     centroids = vertices[faces].mean(axis=1)
     lengths = np.linalg.norm(centroids[f] - midpoints, axis=1)
     lengths += np.linalg.norm(centroids[g] - midpoints, axis=1)
-    return sp.csr_matrix((lengths, (f, g)), shape=(len(faces), len(faces)))
+    both = np.r_[f, g], np.r_[g, f]
+    return sp.csr_matrix((np.r_[lengths, lengths], both), shape=(len(faces), len(faces)))
 
 
 def clean_boundary(faces: np.ndarray) -> np.ndarray:
@@ -113,15 +145,53 @@ def clean_boundary(faces: np.ndarray) -> np.ndarray:
 
     An ear hangs on by one edge; a pinched vertex is one the boundary passes twice. Removing either
     can expose new ones, so this repeats until there are none.
+
+    Returns:
+        (k,) ascending indices of the faces that are left.
     """
-    while len(faces):
-        kept = _largest_part(faces)
-        kept = kept[~_is_ear(kept)]
-        kept = kept[~np.isin(kept, _pinched_vertices(kept)).any(axis=1)]
-        if len(kept) == len(faces):
+    kept = np.arange(len(faces))
+    while len(kept):
+        good = _clean_step(faces[kept])
+        if good.all():
             break
-        faces = kept
-    return faces
+        kept = kept[good]
+    return kept
+
+
+def defect(faces: np.ndarray) -> str | None:
+    """Why the faces, edge-connected and without pinched vertices, are no disk; None if they are."""
+    edges = _edges(faces)
+    # In a consistently oriented manifold, an inner edge has one face on its left, one on its right.
+    forward = faces < np.roll(faces, -1, axis=1)
+    n_left = np.bincount(edges.of_face.ravel(), weights=forward.ravel())
+    if (edges.n_faces > 2).any() or (n_left[edges.n_faces == 2] != 1).any():
+        return "not manifold"
+    boundary = edges.ends[edges.n_faces == 1]
+    if not len(boundary):
+        return "closed"
+    rim, index = np.unique(boundary, return_inverse=True)
+    links = index.reshape(-1, 2).T
+    graph = sp.coo_matrix((np.ones(len(boundary)), links), shape=(len(rim), len(rim)))
+    if csgraph.connected_components(graph, directed=False)[0] > 1:
+        return "has holes"
+    euler = len(np.unique(faces)) - len(edges.n_faces) + len(faces)
+    return None if euler == 1 else "has a handle"
+
+
+def rounded_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """The mesh with its positions rounded to float32, in float64.
+
+    Raises:
+        PatchRejectedError: rounding turns a face over, or leaves it no area.
+    """
+    positions = vertices.astype(np.float32).astype(np.float64)
+    turned = (_area_vectors(vertices, faces) * _area_vectors(positions, faces)).sum(axis=1) <= 0
+    if turned.any():
+        raise PatchRejectedError("rounding")
+    try:
+        return Mesh(positions, faces)
+    except MeshError:
+        raise PatchRejectedError("rounding") from None
 
 
 def align(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, float]:
@@ -138,7 +208,7 @@ def align(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, float]:
         PatchRejectedError: the mean normal vanishes, so there is no canonical direction.
     """
     corners = vertices[faces]
-    area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    area_vectors = _area_vectors(vertices, faces)
     areas = np.linalg.norm(area_vectors, axis=1)
     mean_normal = area_vectors.sum(axis=0)
     flatness = np.linalg.norm(mean_normal) / areas.sum()
@@ -160,50 +230,55 @@ def align(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, float]:
     return (vertices - centre) / np.sqrt(areas.sum()) @ pose, float(flatness)
 
 
-def _require_disk(mesh: Mesh) -> None:
-    """Say what the patch is instead of a disk."""
-    if mesh.is_disk:
-        return
-    if not mesh.is_manifold or mesh.n_components > 1:
-        raise PatchRejectedError("not manifold")
-    holes = len(mesh.boundary_loops)
-    if holes == 0:
-        raise PatchRejectedError("closed")
-    raise PatchRejectedError("has holes" if holes > 1 else "has a handle")
+def _area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    corners = vertices[faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
 
 
 # -------------------------------------------------------------------- topology
 
 
-def _half_edges(faces: np.ndarray) -> np.ndarray:
-    """(3m, 2) sorted vertex pairs; rows 3f … 3f + 2 belong to face f."""
-    return np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+class _Edges(NamedTuple):
+    """Undirected edges of faces.
+
+    Attributes:
+        ends: (e, 2) their vertices.
+        n_faces: (e,) how many faces share each.
+        of_face: (m, 3) the edges of each face.
+    """
+
+    ends: np.ndarray
+    n_faces: np.ndarray
+    of_face: np.ndarray
+
+    @property
+    def neighbours(self) -> np.ndarray:
+        """(2, k) the two faces at each edge that has two."""
+        order = np.argsort(self.of_face, axis=None, kind="stable") // 3
+        first = (self.n_faces.cumsum() - self.n_faces)[self.n_faces == 2]
+        return np.stack([order[first], order[first + 1]])
 
 
-def _inner_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Edges shared by exactly two faces, as (first face, second face, one vertex, other vertex)."""
-    edges = _half_edges(faces)
-    order = np.lexsort(edges.T)
-    edges, owner = edges[order], order // 3
-    same = (edges[1:] == edges[:-1]).all(axis=1)
-    starts = np.flatnonzero(np.r_[True, ~same])
-    pair = starts[np.diff(np.r_[starts, len(edges)]) == 2]
-    return owner[pair], owner[pair + 1], edges[pair, 0], edges[pair, 1]
+def _edges(faces: np.ndarray) -> _Edges:
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    n = np.int64(faces.max() + 1 if len(faces) else 1)
+    # One integer per edge sorts many times faster than pairs do.
+    keys, of_face, n_faces = np.unique(
+        pairs[:, 0] * n + pairs[:, 1], return_inverse=True, return_counts=True
+    )
+    return _Edges(np.stack([keys // n, keys % n], axis=1), n_faces, of_face.reshape(-1, 3))
 
 
-def _largest_part(faces: np.ndarray) -> np.ndarray:
-    f, g, *_ = _inner_edges(faces)
+def _clean_step(faces: np.ndarray) -> np.ndarray:
+    """(m,) which faces to keep: the largest part; if there is one, no ears; if none, no pinches."""
+    edges = _edges(faces)
+    f, g = edges.neighbours
     graph = sp.coo_matrix((np.ones(len(f)), (f, g)), shape=(len(faces), len(faces)))
-    label = csgraph.connected_components(graph, directed=False)[1]
-    return faces[label == np.bincount(label).argmax()]
-
-
-def _is_ear(faces: np.ndarray) -> np.ndarray:
-    f, g, *_ = _inner_edges(faces)
-    return np.bincount(np.r_[f, g], minlength=len(faces)) < 2
-
-
-def _pinched_vertices(faces: np.ndarray) -> np.ndarray:
-    """Vertices at more than two boundary edges."""
-    edges, counts = np.unique(_half_edges(faces), axis=0, return_counts=True)
-    return np.flatnonzero(np.bincount(edges[counts == 1].ravel()) > 2)
+    n_parts, part = csgraph.connected_components(graph, directed=False)
+    if n_parts > 1:
+        return np.asarray(part == np.bincount(part).argmax())
+    ear = (edges.n_faces[edges.of_face] == 2).sum(axis=1) < 2
+    if ear.any():
+        return ~ear
+    rim, passes = np.unique(edges.ends[edges.n_faces == 1], return_counts=True)
+    return np.asarray(~np.isin(faces, rim[passes > 2]).any(axis=1))

@@ -6,6 +6,7 @@ could not read in `failures` instead of stopping.
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import math
 import re
@@ -117,13 +118,15 @@ class CSGParts:
 
 
 class MeshFolder:
-    """All .obj, .off, .ply and .stl files below a folder, each a family of its own.
+    """All .obj, .off, .ply and .stl files below a folder.
 
-    A file that cannot be read is skipped with a warning and listed in `failures`.
+    A file that cannot be read is skipped with a warning and listed in `failures`. Names that differ
+    only by a number, a side, a version or a resolution are one family.
 
     Args:
-        folder: searched recursively.
-        licence: recorded with every mesh.
+        folder: searched recursively. A table `manifest.tsv` in it, if there is one, gives licences
+            by the columns `name` (a file's, without its suffix) and `licence`.
+        licence: recorded with every other mesh.
 
     Raises:
         FileNotFoundError: the folder does not exist or holds no mesh file.
@@ -139,10 +142,33 @@ class MeshFolder:
         self.failures: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[RawMesh]:
+        licences = _licences(self.folder / "manifest.tsv")
         for path in self.paths:
             if (mesh := _read_or_report(path, self.failures)) is not None:
-                name = f"folder/{path.relative_to(self.folder).as_posix()}"
-                yield RawMesh(name, *mesh, self.licence, path.name, family=name)
+                inside = path.relative_to(self.folder)
+                licence = licences.get(path.stem, self.licence)
+                family = f"folder/{inside.with_name(_family(path.stem)).as_posix()}"
+                yield RawMesh(f"folder/{inside.as_posix()}", *mesh, licence, path.name, family)
+
+
+# Endings of names that near-copies differ by: numbers, sides, versions, resolutions.
+_VARIANT = re.compile(
+    r"([-_ ]?v?\d+|[-_ ](l|r|left|right|side|low|high|hr|low-?res|resolution|copy))$", re.IGNORECASE
+)
+
+
+def _family(stem: str) -> str:
+    """A file's name without such endings."""
+    while (shorter := _VARIANT.sub("", stem)) and shorter != stem:
+        stem = shorter
+    return stem
+
+
+def _licences(table: Path) -> dict[str, str]:
+    if not table.exists():
+        return {}
+    with table.open(newline="") as file:
+        return {row["name"]: row["licence"] for row in csv.DictReader(file, delimiter="\t")}
 
 
 class Thingi10K:

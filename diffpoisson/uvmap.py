@@ -1,66 +1,142 @@
-"""A valid UV map of a disk, whatever map one starts from: repair, untangle, polish, certify."""
+"""A valid UV map of any surface: cut it into disks, flatten each, pack and certify them."""
 
 from __future__ import annotations
 
-import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffpoisson.certificate import Certificate, certify, orientations
+from diffpoisson.certificate import Certificate, certify
+from diffpoisson.chart import flatten_disk
 from diffpoisson.mesh import Mesh
-from diffpoisson.parameterization import slim, tutte
 from diffpoisson.poisson import PoissonSolver
-from diffpoisson.repair import clamp_flips, untangle
+
+Init = Float[Tensor, "n 2"] | Callable[[Mesh], Tensor]
 
 
 @dataclass(frozen=True)
-class UVMap:
-    """A map of a disk to the plane, and what is known of it.
+class Chart:
+    """One disk of a UV map.
 
     Attributes:
-        uv: (n, 2) the map, in the mesh's units.
+        faces: (k,) int64 indices of its faces, ascending.
         certificate: exact facts and distortion.
         method: the stages it came through, such as "init", "init+clamp" or "tutte", before SLIM.
         slim_iterations: iterations of the final polish.
         milliseconds: time of each stage that ran.
     """
 
-    uv: Float[Tensor, "n 2"]
+    faces: Int[Tensor, "k"]
     certificate: Certificate
     method: str
     slim_iterations: int
     milliseconds: dict[str, float]
 
+
+@dataclass(frozen=True)
+class UVMap:
+    """A map of a surface to the plane, in one or more charts, and what is known of it.
+
+    Attributes:
+        mesh: the surface cut open: the input's faces in their order, seam vertices repeated; the
+            input itself where nothing was cut.
+        uv: (n', 2) image of each vertex of `mesh`, in the input's units.
+        vertex_map: (n',) int64 the input's vertex that each vertex of `mesh` is a copy of.
+        charts: the disks, whose faces are all of the mesh's.
+    """
+
+    mesh: Mesh
+    uv: Float[Tensor, "n 2"]
+    vertex_map: Int[Tensor, "n"]
+    charts: tuple[Chart, ...]
+
+    @cached_property
+    def chart_of_face(self) -> Int[Tensor, "m"]:
+        """(m,) int64 index of each face's chart."""
+        index = self.mesh.faces.new_empty(self.mesh.n_faces)
+        for i, chart in enumerate(self.charts):
+            index[chart.faces] = i
+        return index
+
     @property
     def flipped(self) -> int:
         """Number of triangles that are not positively oriented: zero."""
-        return self.certificate.n_flipped
+        return sum(chart.certificate.n_flipped for chart in self.charts)
 
     @property
     def energy(self) -> float:
         """Area-weighted mean symmetric Dirichlet energy, 4 at an isometry."""
-        return self.certificate.energy
+        return self._mean([chart.certificate.energy for chart in self.charts])
 
     @property
+    def mean_distortion(self) -> float:
+        """Area-weighted mean of max(σ₁, 1/σ₂), 1 at an isometry."""
+        return self._mean([chart.certificate.mean_distortion for chart in self.charts])
+
+    @property
+    def max_distortion(self) -> float:
+        """Largest max(σ₁, 1/σ₂)."""
+        return max(chart.certificate.max_distortion for chart in self.charts)
+
+    @property
+    def min_determinant(self) -> float:
+        """Smallest det J."""
+        return min(chart.certificate.min_determinant for chart in self.charts)
+
+    @cached_property
     def certified(self) -> bool:
-        """Whether the map is one-to-one for certain."""
-        return self.certificate.injective
+        """Whether the map is one-to-one for certain: every chart is, and their boxes are apart."""
+        return all(chart.certificate.injective for chart in self.charts) and self._boxes_apart()
+
+    @property
+    def method(self) -> str:
+        """The stages that its charts came through, each way once, the most frequent first."""
+        return ", ".join(way for way, _ in Counter(c.method for c in self.charts).most_common())
+
+    @property
+    def slim_iterations(self) -> int:
+        """Iterations of SLIM, of all charts."""
+        return sum(chart.slim_iterations for chart in self.charts)
+
+    @property
+    def milliseconds(self) -> dict[str, float]:
+        """Time of each stage that ran, summed over the charts."""
+        total: dict[str, float] = {}
+        for chart in self.charts:
+            for stage, time in chart.milliseconds.items():
+                total[stage] = total.get(stage, 0.0) + time
+        return total
+
+    def _mean(self, values: list[float]) -> float:
+        """Mean over the charts, by their areas."""
+        areas = [float(self.mesh._double_measures[chart.faces].sum()) for chart in self.charts]
+        return float(np.average(values, weights=areas))
+
+    def _boxes_apart(self) -> bool:
+        """Whether the charts' bounding boxes are disjoint."""
+        corners = [self.uv[self.mesh.faces[chart.faces]].flatten(0, 1) for chart in self.charts]
+        low = torch.stack([points.amin(0) for points in corners])
+        high = torch.stack([points.amax(0) for points in corners])
+        meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1)
+        return int(meet.sum()) == len(self.charts)
 
 
 def parameterize(
     mesh: Mesh,
-    init: Float[Tensor, "n 2"] | None = None,
+    init: Init | None = None,
     *,
+    cut: bool = False,
     solver: PoissonSolver | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 500,
 ) -> UVMap:
-    """A flip-free map of a disk with low isometric distortion.
+    """A flip-free map of a surface to the plane with low isometric distortion.
 
     An initial map with flips is repaired by clamping its singular values, and if that is not enough
     by untangling. SLIM then descends to a local minimum of the symmetric Dirichlet energy without
@@ -68,8 +144,10 @@ def parameterize(
     itself, Tutte's embedding takes its place.
 
     Args:
-        mesh: a topological disk in space.
-        init: (n, 2) a map to start from, in the mesh's units, such as a network's.
+        mesh: a surface in space; a topological disk unless `cut`.
+        init: a map to start from, in the mesh's units, such as a network's: (n, 2) if the mesh is
+            one disk, or a function that is called with the mesh of each chart.
+        cut: cut what is not a disk.
         solver: a `PoissonSolver` of this mesh whose factor to use; made if it is needed.
         tolerance: of SLIM, see `slim`.
         max_iterations: of SLIM.
@@ -78,78 +156,18 @@ def parameterize(
         MeshError: not a disk in space, or too distorted even for Tutte's embedding.
         ValueError: `init` is not (n, 2) and finite.
     """
-    polish = {"tolerance": tolerance, "max_iterations": max_iterations}
-    if init is not None:
-        _check(mesh, init)
-        repaired = _repaired(mesh, init, solver)
-        if not repaired.flips:
-            uvmap = _polished(mesh, repaired, polish)
-            if uvmap.certified:
-                return uvmap
-    stages = _Stages(mesh)
-    stages.start("tutte", lambda: tutte(mesh))
-    from_tutte = _polished(mesh, stages, polish)
-    if init is None or repaired.flips or from_tutte.certified:
-        return from_tutte
-    return min(uvmap, from_tutte, key=lambda candidate: candidate.energy)  # both overlap
-
-
-def _repaired(mesh: Mesh, init: Tensor, solver: PoissonSolver | None) -> _Stages:
-    stages = _Stages(mesh)
-    stages.start("init", lambda: init.detach().to(mesh.vertices))
-    if stages.flips:
-        stages.run("clamp", lambda uv: clamp_flips(solver or PoissonSolver(mesh), uv)[0])
-    if stages.flips:
-        stages.run("untangle", lambda uv: untangle(mesh, uv)[0])
-    return stages
-
-
-def _polished(mesh: Mesh, stages: _Stages, options: dict[str, Any]) -> UVMap:
-    """A flip-free map after SLIM, certified."""
-    method = "+".join(stages.passed)
-    result = stages.timed("slim", lambda: slim(mesh, stages.uv, **options))
-    certificate = stages.timed("certify", lambda: certify(mesh, result.uv))
-    iterations = len(result.energies) - 1
-    return UVMap(result.uv, certificate, method, iterations, stages.milliseconds)
-
-
-class _Stages:
-    """The map as it passes through stages, with their names and times."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self._faces = mesh.faces.cpu().numpy()
-        self.uv: Tensor = mesh.vertices.new_zeros(0, 2)
-        self.passed: list[str] = []
-        self.milliseconds: dict[str, float] = {}
-
-    @property
-    def flips(self) -> bool:
-        """Whether the map has a triangle that is not positively oriented."""
-        triangles = self.uv.detach().cpu().double().numpy()[self._faces]
-        return bool((orientations(triangles) <= 0).any())
-
-    def start(self, name: str, make: Callable[[], Tensor]) -> None:
-        """Begin anew with a map."""
-        self.uv, self.passed = self.timed(name, make), [name]
-
-    def run(self, name: str, change: Callable[[Tensor], Tensor]) -> None:
-        """Pass the map through one more stage."""
-        self.uv = self.timed(name, lambda: change(self.uv))
-        self.passed.append(name)
-
-    def timed(self, name: str, work: Callable[[], Any]) -> Any:
-        """The result of some work, whose time is kept."""
-        start = time.perf_counter()
-        result = work()
-        self.milliseconds[name] = 1000 * (time.perf_counter() - start)
-        return result
-
-
-def _check(mesh: Mesh, init: Tensor) -> None:
-    if init.shape != (mesh.n_vertices, 2):
-        raise ValueError(
-            f"parameterize: expected init of shape (n={mesh.n_vertices}, 2), "
-            f"got {tuple(init.shape)}"
-        )
-    if not torch.isfinite(init).all():
-        raise ValueError("parameterize: init has entries that are not finite; leave it out")
+    if cut:
+        raise NotImplementedError("parameterize: cut=True is under way")
+    start = init(mesh) if callable(init) else init
+    flat = flatten_disk(
+        mesh, start, solver=solver, tolerance=tolerance, max_iterations=max_iterations
+    )
+    chart = Chart(
+        torch.arange(mesh.n_faces, device=mesh.device),
+        certify(mesh, flat.uv),
+        flat.method,
+        flat.slim_iterations,
+        flat.milliseconds,
+    )
+    vertex_map = torch.arange(mesh.n_vertices, device=mesh.device)
+    return UVMap(mesh, flat.uv, vertex_map, (chart,))

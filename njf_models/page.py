@@ -58,7 +58,7 @@ def uv_page(
         "ramp": f"linear-gradient(90deg, {', '.join(_VIRIDIS)})",
         "ticks": _ticks(limit),
         "simplified": _simplified_note(len(shown[0]), mesh.n_faces),
-        "histogram": histogram_svg(maps, uvmap.mesh.areas.numpy(), max(limit, 2.0)),
+        "histogram": histogram(maps, uvmap.mesh.areas.numpy(), max(limit, 2.0)),
         "flips_note": f" Flipped triangles ({html.escape(', '.join(flipped_maps))}) are not in it."
         if flipped_maps
         else "",
@@ -232,7 +232,7 @@ def _ticks(limit: float) -> str:
 # -------------------------------------------------------------------- histogram
 
 
-def histogram_svg(
+def histogram(
     maps: Sequence[MeasuredMap], areas: Float[np.ndarray, "m"], limit: float, bins: int = 48
 ) -> str:
     """Shares of the area over distortion on a logarithmic axis, the last bin for all beyond.
@@ -243,30 +243,39 @@ def histogram_svg(
         limit: end of the axis.
         bins: of equal width in log distortion.
     """
-    width, height, left, bottom, top = 960, 240, 44, 28, 10
     edges = np.linspace(0, math.log(limit), bins + 1)
     shares = [_shares(m.distortion.numpy(), areas, edges) for m in maps]
-    largest = max(float(share.max()) for share in shares) or 1.0  # all flipped
-    x = np.linspace(left, width - 8, bins + 2)  # one more bin for what lies beyond
-    parts = []
-    for i, share in reversed(list(enumerate(shares))):
-        y = top + (height - top - bottom) * (1 - share / largest)
-        steps = [f"{x[k]:.1f},{y[k]:.1f} {x[k + 1]:.1f},{y[k]:.1f}" for k in range(bins + 1)]
-        outline = " ".join(steps)
-        floor = height - bottom
-        parts.append(
-            f'<g class="map-{i}"><polygon class="area" points="{x[0]:.1f},{floor} {outline} '
-            f'{x[-1]:.1f},{floor}"/><polyline class="outline" points="{outline}"/></g>'
-        )
-    axes = _axes(x, limit, largest, (left, top, height - bottom))
-    titles = ", ".join(html.escape(m.title) for m in maps)
-    key = "".join(
-        f'<li class="map-{i}"><i></i>{html.escape(m.title)}</li>' for i, m in enumerate(maps)
+    largest = max(float(share.max()) for share in shares) or 1.0  # zero if all is flipped
+    outlines = [_steps(100 * (1 - share / largest)) for share in shares]
+    groups = "".join(
+        f'<g class="map-{i}"><polygon class="area" points="0,100 {points} {bins + 1},100"/>'
+        f'<polyline class="outline" points="{points}"/></g>'
+        for i, points in enumerate(outlines)
     )
+    titles = [html.escape(m.title) for m in maps]
+    key = "".join(f'<li class="map-{i}"><i></i>{title}</li>' for i, title in enumerate(titles))
     return (
-        f'<ul class="key">{key}</ul>\n<svg class="histogram" viewBox="0 0 {width} {height}" '
-        f'role="img" aria-label="Histogram of distortion: {titles}">{axes}{"".join(parts)}</svg>'
+        f'<ul class="key">{key}</ul>\n<div class="histogram"><svg viewBox="0 0 {bins + 1} 100" '
+        f'preserveAspectRatio="none" role="img" aria-label="Histogram: {", ".join(titles)}">'
+        f"{groups}</svg>"
+        f'<span class="most">{100 * largest:.3g}%</span>{_marks(limit, bins)}</div>'
     )
+
+
+def _steps(heights: Float[np.ndarray, "b"]) -> str:
+    """The outline of bars of width one, as points of an SVG."""
+    return " ".join(f"{k},{y:.2f} {k + 1},{y:.2f}" for k, y in enumerate(heights.tolist()))
+
+
+def _marks(limit: float, bins: int) -> str:
+    """Numbers below a logarithmic axis of `bins` bins and one more."""
+    places = np.linspace(0, 100 * bins / (bins + 1), 5)[:-1]
+    numbers = np.geomspace(1, limit, 5)[:-1]
+    marks = "".join(
+        f'<span style="left: {place:.1f}%">{number:.3g}</span>'
+        for place, number in zip(places, numbers, strict=True)
+    )
+    return f'<div class="marks">{marks}<span>beyond {limit:g}</span></div>'
 
 
 def _shares(
@@ -277,22 +286,6 @@ def _shares(
     place = np.log(np.maximum(distortion[upright], 1))
     index = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, len(edges) - 1)
     return np.bincount(index, areas[upright], len(edges)) / areas.sum()
-
-
-def _axes(x: np.ndarray, limit: float, largest: float, frame: tuple[float, float, float]) -> str:
-    left, top, floor = frame
-    marks = np.geomspace(1, limit, 5)
-    places = x[0] + np.linspace(0, 1, 5) * (x[-2] - x[0])
-    labels = "".join(
-        f'<text x="{place:.1f}" y="{floor + 18}" text-anchor="middle">{mark:.3g}</text>'
-        for place, mark in zip(places[:-1], marks[:-1], strict=True)
-    )
-    return (
-        f'<line class="axis" x1="{left}" y1="{floor}" x2="{x[-1]:.1f}" y2="{floor}"/>{labels}'
-        f'<text x="{x[-1]:.1f}" y="{floor + 18}" text-anchor="end">beyond {limit:g}</text>'
-        f'<text x="{left - 6}" y="{floor}" text-anchor="end">0</text>'
-        f'<text x="{left - 6}" y="{top + 8}" text-anchor="end">{100 * largest:.3g}%</text>'
-    )
 
 
 # -------------------------------------------------------------------- data of the views
@@ -352,7 +345,7 @@ def _viewpoint(mesh: dp.Mesh, y_up: bool) -> tuple[list[float], list[float]]:
     aside = np.array([0.6, 0.4, 0.7] if y_up else [0.6, -0.7, 0.4])
     areas = mesh.areas.numpy()
     front = (mesh.normals.numpy() * areas[:, None]).sum(0) / areas.sum()
-    eye = front + 0.35 * aside if np.linalg.norm(front) > 0.3 else aside
+    eye = front + 0.8 * aside if np.linalg.norm(front) > 0.3 else aside
     eye = eye / np.linalg.norm(eye)
     if abs(eye @ up) > 0.9:
         up = np.array([0.0, 0.0, -1.0] if y_up else [0.0, 1.0, 0.0])

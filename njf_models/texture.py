@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-Picture = UInt8[np.ndarray, "h w 4"]
+Picture = UInt8[np.ndarray, "_ _ 4"]
 
 _SMALLEST, _LARGEST = 256, 2048  # sides of a baked picture, in pixels
 

@@ -102,7 +102,7 @@ class View {
     this.box = document.getElementById(id);
     this.camera = camera;
     this.scene = new THREE.Scene();
-    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
+    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.box.appendChild(this.renderer.domElement);
     this.waiting = false;
@@ -138,19 +138,34 @@ class Surface extends View {
     this.controls.staticMoving = true;
     this.controls.addEventListener('change', () => this.draw());
     const follow = () => { this.controls.update(); requestAnimationFrame(follow); };
-    this.reset(); follow();
+    follow();
   }
   reset() {
     this.controls.target.set(0, 0, 0);
     this.camera.up.set(...data.up);
-    this.camera.position.set(...data.eye).multiplyScalar(3.9);
+    this.camera.position.set(...data.eye).multiplyScalar(this.distance());
     this.controls.update(); this.draw();
   }
+  // The least from which all vertices are in sight, and a little more.
+  distance() {
+    const eye = new THREE.Vector3(...data.eye), p = new THREE.Vector3();
+    const right = new THREE.Vector3(...data.up).cross(eye).normalize();
+    const above = eye.clone().cross(right);
+    const slope = Math.tan(this.camera.fov * Math.PI / 360);
+    let least = 0.1;
+    for (let i = 0; i < positions.length; i += 3) {
+      p.fromArray(positions, i);
+      const across = Math.max(Math.abs(p.dot(above)), Math.abs(p.dot(right)) / this.camera.aspect);
+      least = Math.max(least, p.dot(eye) + across / slope);
+    }
+    return 1.06 * least;
+  }
   fit(w, h) {
+    const first = !this.fitted;
+    this.fitted = true;
     this.camera.aspect = w / h;
-    // The unit ball stays in sight also where the view is higher than wide.
-    this.camera.fov = w < h ? 2 * Math.atan(Math.tan(0.305) * h / w) * 180 / Math.PI : 35;
     this.camera.updateProjectionMatrix(); this.controls.handleResize();
+    if (first) this.reset();
   }
   show(map) {
     this.geometry.setAttribute('texture_', new THREE.BufferAttribute(corners(map.uv, 2, faces), 2));

@@ -92,7 +92,8 @@ def read_mesh_file(path: Path) -> MeshFile:
     _require_readable(path)
     mesh = _read_obj(path) if path.suffix.lower() == ".obj" else _read_scene(path)
     if not len(mesh.faces):
-        points = f", only {len(mesh.vertices):,} points" if len(mesh.vertices) else ""
+        n = len(mesh.vertices)
+        points = f", only {n:,} point{'s' if n > 1 else ''}" if n else ""
         raise MeshFileError(f"no triangles in it{points}")
     return mesh
 

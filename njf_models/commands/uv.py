@@ -10,9 +10,10 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -273,6 +274,7 @@ class _Workers:
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(["njf_models.meshfiles", "njf_models.commands.uv"])
         self.threads = ThreadPoolExecutor(jobs)
+        self.starting = threading.Lock()  # a process can only be ended once it has started
         self.running: set[Any] = set()
         self.stopped = False
 
@@ -281,21 +283,24 @@ class _Workers:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
-            self.stopped = True
-            for process in list(self.running):
-                process.terminate()
+            with self.starting:
+                self.stopped = True
+                for process in self.running:
+                    process.terminate()
         self.threads.shutdown(cancel_futures=True)
 
-    def submit(self, task: Task) -> Any:
+    def submit(self, task: Task) -> Future[dict[str, Any]]:
+        """Run a task as soon as a process is free."""
         return self.threads.submit(self._isolated, task)
 
     def _isolated(self, task: Task) -> dict[str, Any]:
         receiver, sender = self.context.Pipe(duplex=False)
         process = self.context.Process(target=_child, args=(task, sender))
-        self.running.add(process)
-        process.start()
-        if self.stopped:
-            process.terminate()
+        with self.starting:
+            if self.stopped:
+                raise CancelledError
+            process.start()
+            self.running.add(process)
         sender.close()
         try:
             record: dict[str, Any] = receiver.recv()
@@ -304,7 +309,8 @@ class _Workers:
             error = f"the process ended without a result (exit code {process.exitcode})"
             record = {"input": str(task.input), "status": "failed", "error": error}
         process.join()
-        self.running.discard(process)
+        with self.starting:
+            self.running.discard(process)
         return record
 
 
@@ -323,7 +329,7 @@ def _child(task: Task, sender: Connection) -> None:
 
 def _finish(records: list[dict[str, Any]], options: argparse.Namespace, single: bool) -> int:
     failures = [record for record in records if record["status"] != "ok"]
-    lines = list(_summary(records, single))
+    lines = list(_summary(records, None if single else options.input))
     to_stdout = options.json == "-"
     if lines:
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
@@ -334,17 +340,18 @@ def _finish(records: list[dict[str, Any]], options: argparse.Namespace, single: 
     return 1 if failures else 0
 
 
-def _summary(records: list[dict[str, Any]], single: bool) -> Iterator[str]:
+def _summary(records: list[dict[str, Any]], folder: Path | None) -> Iterator[str]:
     """A line per file, and of a batch one more with the counts."""
-    names = [Path(record["input"]).name for record in records]
+    paths = [Path(record["input"]) for record in records]
+    names = [str(path.relative_to(folder)) if folder else path.name for path in paths]
     width = max(map(len, names))
     for name, record in zip(names, records, strict=True):
         if record["status"] == "ok":
             yield f"{name:<{width}}  {_line(record)}"
             yield from (f"{'':<{width}}  {note}" for note in record["notes"])
-        elif not single:
+        elif folder:
             yield f"{name:<{width}}  FAILED"
-    if not single:
+    if folder:
         failed = sum(record["status"] != "ok" for record in records)
         yield f"{len(records)} files: {len(records) - failed} mapped, {failed} failed"
 
@@ -379,14 +386,16 @@ def _finite(value: Any) -> Any:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
-    return value
+    return int(text)

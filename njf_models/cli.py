@@ -69,7 +69,7 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, CommandError):
         return str(error)
     if isinstance(error, ModuleNotFoundError):
-        return f"{error.name} is not installed: pip install 'diffpoisson[train]'"
+        return f"{error.name} is not installed: pip install 'diffpoisson[uv]'"
     text = " ".join(str(error).split()) or "no message"
     return f"{text} ({type(error).__name__}; --debug shows where)"
 

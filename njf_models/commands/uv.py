@@ -39,9 +39,6 @@ UVs lie in the unit square, both axes by the same scale.
 exit codes: 0 every file was mapped, 1 some were not, 2 wrong usage, 130 interrupted
 """
 
-_READABLE = (".glb", ".obj", ".off", ".ply", ".stl")
-_WRITABLE = (".glb", ".obj")
-
 
 def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     """Register the command."""
@@ -113,8 +110,10 @@ def _check_usage(options: argparse.Namespace) -> None:
             raise UsageError(f"{path} is a folder, but the input is a file: name a file")
     if target is None:
         return
-    if target.suffix.lower() not in _WRITABLE:
-        raise UsageError(f"{target}: only {' and '.join(_WRITABLE)} files are written")
+    from njf_models.meshfiles import WRITABLE  # noqa: PLC0415  (imports torch)
+
+    if target.suffix.lower() not in WRITABLE:
+        raise UsageError(f"{target}: only {' and '.join(WRITABLE)} files are written")
     if target.resolve() == source.resolve():
         raise UsageError("input and output are the same file: name another one")
 
@@ -135,20 +134,22 @@ def _single(options: argparse.Namespace) -> Task:
 
 def _folder(options: argparse.Namespace) -> list[Task]:
     """A task for each mesh file, outputs in the same subfolders."""
+    from njf_models.meshfiles import READABLE  # noqa: PLC0415  (imports torch)
+
     root = options.input
     found = sorted(root.rglob("*") if options.recursive else root.glob("*"))
     own = [folder.resolve() for folder in (options.output, options.report) if folder is not None]
     tasks = []
     for path in found:
         mine = any(path.resolve().is_relative_to(folder) for folder in own)
-        if path.suffix.lower() in _READABLE and path.is_file() and not mine:
+        if path.suffix.lower() in READABLE and path.is_file() and not mine:
             name = path.relative_to(root)
             output = options.output and options.output / name.with_suffix(f".{options.format}")
             page = options.report and options.report / name.with_suffix(".html")
             tasks.append(_task(options, path, output, page))
     if not tasks:
         hint = "" if options.recursive else "; --recursive looks into subfolders"
-        raise CommandError(f"no {', '.join(_READABLE)} file in {root}{hint}")
+        raise CommandError(f"no {', '.join(READABLE)} file in {root}{hint}")
     return tasks
 
 

@@ -76,6 +76,21 @@ def test_help_of_a_command_has_examples_that_parse(command, capsys):
         assert parser().parse_args(example.split()).command == command
 
 
+def test_the_page_of_the_docs_agrees_with_the_parser():
+    """Its examples parse, and it knows every option."""
+    from njf_models.cli import parser
+
+    text = (ROOT / "docs" / "cli.md").read_text()
+    examples = re.findall(r"^\$ njf (.*)$", text, re.MULTILINE)
+    assert len(examples) >= 6
+    for example in examples:
+        assert parser().parse_args(example.split()).command == example.split()[0]
+    commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    options = {o for action in commands["uv"]._actions for o in action.option_strings}  # type: ignore[index]
+    for option in options - {"-h", "--help"}:
+        assert f"`{option}" in text
+
+
 def test_help_does_not_wait_for_torch():
     program = (
         "import sys; from njf_models.cli import parser; parser().format_help();"

@@ -138,8 +138,8 @@ def _obj_paint(path: Path, obj: ObjFile) -> Paint | None:
     if not len(obj.texcoords) or not obj.materials:
         return None
     materials = _materials(path.parent, obj.libraries)
-    images = [_picture(materials.get(name, {}).get("image"), materials.get(name, {}).get("kd"))
-              for name in obj.materials]  # fmt: skip
+    used = [materials.get(name, {}) for name in obj.materials]
+    images = [_picture(material.get("image"), material.get("kd")) for material in used]
     if all(image.shape[:2] == (1, 1) for image in images):
         return None
     images.append(_picture(None, None))  # of faces before the first material: index -1
@@ -175,13 +175,13 @@ def _read_scene(path: Path) -> MeshFile:
     if not surfaces:
         points = sum(len(part.vertices) for part in parts)
         return MeshFile(path, np.zeros((points, 3)), np.zeros((0, 3), dtype=np.int64))
-    offsets = np.cumsum([0] + [len(part.vertices) for part in surfaces])
-    vertices = np.concatenate([np.asarray(part.vertices, dtype=np.float64) for part in surfaces])
-    faces = [np.asarray(part.faces, dtype=np.int64) + o for part, o in zip(surfaces, offsets, strict=False)]  # fmt: skip # noqa: E501
-    merged = np.concatenate(faces)
+    sizes = [len(part.vertices) for part in surfaces]
+    starts = np.repeat(np.cumsum(sizes) - sizes, [len(part.faces) for part in surfaces])
+    vertices = np.concatenate([part.vertices for part in surfaces]).astype(np.float64)
+    faces = np.concatenate([part.faces for part in surfaces]).astype(np.int64) + starts[:, None]
     if kind in ("stl", "glb"):
-        vertices, merged = _each_position_once(vertices, merged)
-    return MeshFile(path, vertices, merged, _scene_paint(surfaces))
+        vertices, faces = _each_position_once(vertices, faces)
+    return MeshFile(path, vertices, faces, _scene_paint(surfaces))
 
 
 def _placed(scene: Any, node: str) -> Any:
@@ -203,11 +203,7 @@ def _scene_paint(surfaces: list[Any]) -> Paint | None:
     images, uvs, sizes = [], [], []
     for part in surfaces:
         uv = getattr(part.visual, "uv", None)
-        material = getattr(part.visual, "material", None)
-        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        factor = getattr(material, "baseColorFactor", None)
-        colour = None if factor is None else np.asarray(factor)[:3] / 255
-        images.append(_picture(image if uv is not None else None, colour))
+        images.append(_base_colour(getattr(part.visual, "material", None), uv is not None))
         uvs.append(
             (np.zeros((len(part.vertices), 2)) if uv is None else np.asarray(uv))[part.faces]
         )
@@ -215,6 +211,13 @@ def _scene_paint(surfaces: list[Any]) -> Paint | None:
     if all(image.shape[:2] == (1, 1) for image in images):
         return None
     return Paint(np.concatenate(uvs), np.repeat(np.arange(len(sizes)), sizes), tuple(images))
+
+
+def _base_colour(material: Any, has_uv: bool) -> np.ndarray:
+    """The picture of a trimesh material, or its colour."""
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    return _picture(image if has_uv else None, None if factor is None else factor[:3] / 255)
 
 
 def _picture(image: Any, colour: Any) -> np.ndarray:
@@ -314,19 +317,32 @@ def checker_picture(squares: int = 32, pixels: int = 32) -> np.ndarray:
 def _write_obj(
     folder: Path, stem: str, file: MeshFile, layout: Layout, picture: np.ndarray | None
 ) -> list[str]:
-    material = None if picture is None else (f"{stem}.mtl", "surface")
-    if file.obj is not None:
-        text = obj_text(file.obj, layout.uv, layout.corners, material)
-    else:
-        text = plain_obj(file.vertices, file.faces, layout.uv, layout.corners, material)
     names = []
     if picture is not None:
         _image(picture).save(folder / f"{stem}.png")
-        mtl = f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {stem}.png\n"
-        (folder / f"{stem}.mtl").write_text(mtl, encoding="utf-8")
-        names = [f"{stem}.png", f"{stem}.mtl"]
+        names = [f"{stem}.png"]
+    if materials := _mtl_text(stem, file, picture):
+        (folder / f"{stem}.mtl").write_bytes(materials)
+        names.append(f"{stem}.mtl")
+    statements = {
+        "library": f"{stem}.mtl" if materials else None,
+        "material": None if picture is None else "surface",
+    }
+    if file.obj is not None:
+        text = obj_text(file.obj, layout.uv, layout.corners, **statements)
+    else:
+        text = plain_obj(file.vertices, file.faces, layout.uv, layout.corners, **statements)
     (folder / f"{stem}.obj").write_bytes(text.encode("utf-8", errors="surrogateescape"))
     return [*names, f"{stem}.obj"]
+
+
+def _mtl_text(stem: str, file: MeshFile, picture: np.ndarray | None) -> bytes:
+    """Of one material with a picture, or what the file's own libraries say; may be nothing."""
+    if picture is not None:
+        return f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {stem}.png\n".encode()
+    libraries = [] if file.obj is None else file.obj.libraries
+    paths = [file.path.parent / name for name in libraries]
+    return b"\n".join(path.read_bytes() for path in paths if path.is_file())
 
 
 def _write_glb(

@@ -16,8 +16,6 @@ from jaxtyping import Float, Int
 
 from njf_models.polygons import triangulated
 
-_REPLACED = ("vt", "usemtl", "mtllib")  # statements that other UVs make obsolete
-
 
 @dataclass(frozen=True, eq=False)
 class ObjFile:
@@ -112,7 +110,9 @@ def obj_text(
     obj: ObjFile,
     texcoords: Float[np.ndarray, "t 2"],
     triangle_texcoords: Int[np.ndarray, "m 3"],
-    material: tuple[str, str] | None = None,
+    *,
+    library: str | None = None,
+    material: str | None = None,
 ) -> str:
     """The same text with other texture coordinates.
 
@@ -122,27 +122,30 @@ def obj_text(
         obj: the file as it was read.
         texcoords: (t, 2) new coordinates.
         triangle_texcoords: (m, 3) index of each corner of `obj.triangles`.
-        material: name of an MTL file and of the material in it that all polygons get.
+        library: name of the MTL file to use instead of its own.
+        material: one for all polygons instead of their own.
     """
     new_corner, whole = _texcoord_of_corner(obj, triangle_texcoords)
     start = np.concatenate([[0], np.cumsum(obj.sizes)])
     first_triangle = np.searchsorted(obj.polygon_of_triangle, np.arange(len(obj.sizes) + 1))
     polygon_at = dict(zip(obj.line_of_polygon.tolist(), range(len(obj.sizes)), strict=True))
     head = [f"vt {u:.9g} {v:.9g}" for u, v in texcoords.tolist()]
-    if material is not None:
-        head = [f"mtllib {material[0]}", *head, f"usemtl {material[1]}"]
+    head += _statement("usemtl", material)
+    replaced = ("vt", "mtllib") if material is None else ("vt", "mtllib", "usemtl")
 
     def face(words: list[str], corners: Iterator[int], indices: Iterator[int]) -> str:
         parts = (words[corner].split("/") for corner in corners)
-        tokens = (f"{p[0]}/{t + 1}" + (f"/{p[2]}" if len(p) > 2 else "")
-                  for p, t in zip(parts, indices, strict=True))  # fmt: skip
+        tokens = (
+            f"{p[0]}/{t + 1}" + (f"/{p[2]}" if p[2:] not in ([], [""]) else "")
+            for p, t in zip(parts, indices, strict=True)
+        )
         return " ".join(["f", *tokens])
 
-    written: list[str] = []
+    written = _statement("mtllib", library)
     for number, line in enumerate(obj.lines):
         i = polygon_at.get(number)
         if i is None:
-            if (line.split(maxsplit=1) or [""])[0] not in _REPLACED:
+            if (line.split(maxsplit=1) or [""])[0] not in replaced:
                 written.append(line)
             continue
         written.extend(head)
@@ -163,16 +166,22 @@ def plain_obj(
     faces: Int[np.ndarray, "m 3"],
     texcoords: Float[np.ndarray, "t 2"],
     triangle_texcoords: Int[np.ndarray, "m 3"],
-    material: tuple[str, str] | None = None,
+    *,
+    library: str | None = None,
+    material: str | None = None,
 ) -> str:
     """An OBJ of triangles: vertices once, texture coordinates once per side of a seam."""
-    head = [] if material is None else [f"mtllib {material[0]}"]
+    head = _statement("mtllib", library)
     head += [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
     head += [f"vt {u:.9g} {v:.9g}" for u, v in texcoords.tolist()]
-    head += [] if material is None else [f"usemtl {material[1]}"]
+    head += _statement("usemtl", material)
     corners = np.stack([faces, triangle_texcoords], axis=-1).reshape(-1, 6) + 1
     body = ["f {}/{} {}/{} {}/{}".format(*row) for row in corners.tolist()]
     return "\n".join([*head, *body, ""])
+
+
+def _statement(keyword: str, name: str | None) -> list[str]:
+    return [] if name is None else [f"{keyword} {name}"]
 
 
 _CORNER = re.compile(r"(-?\d+)(?:/(-?\d+)?(?:/(-?\d+)?)?)?")

@@ -52,22 +52,43 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add = parser.add_argument
     add("input", type=Path, help="obj, ply, off, stl or glb file, or a folder of them")
     add("output", type=Path, nargs="?", help="obj or glb file; a folder, if the input is one")
-    add("--report", type=Path, metavar="PAGE.html",
-        help="write a page to look at the map, beside SLIM and LSCM; a folder of them for a folder")  # fmt: skip # noqa: E501
+    add(
+        "--report",
+        type=Path,
+        metavar="PAGE.html",
+        help="write a page to look at the map, beside SLIM and LSCM; a folder of them for a folder",
+    )
     add("--json", metavar="FILE", help="write figures and failures as JSON; - for stdout")
-    add("--start", choices=("network", "tutte"), default="network",
-        help="what makes the first map of a chart (default: network)")  # fmt: skip
+    add(
+        "--start",
+        choices=("network", "tutte"),
+        default="network",
+        help="what makes the first map of a chart (default: network)",
+    )
     add("--no-cut", action="store_true", help="fail where the mesh is no disk, instead of cutting")
-    add("--tolerance", type=_positive, default=1e-6, metavar="T",
-        help="SLIM stops when an iteration gains less than this fraction (default: 1e-6)")  # fmt: skip # noqa: E501
-    add("--checkerboard", action="store_true",
-        help="texture the output with a checkerboard, unless it has pictures of its own")  # fmt: skip # noqa: E501
+    add(
+        "--tolerance",
+        type=_positive,
+        default=1e-6,
+        metavar="T",
+        help="SLIM stops when an iteration gains less than this fraction (default: 1e-6)",
+    )
+    add(
+        "--checkerboard",
+        action="store_true",
+        help="texture the output with a checkerboard, unless it has pictures of its own",
+    )
     folders = parser.add_argument_group("folders")
-    folders.add_argument("--format", choices=("obj", "glb"), default="obj",
-                         help="of the files written (default: obj)")  # fmt: skip
+    folders.add_argument(
+        "--format",
+        choices=("obj", "glb"),
+        default="obj",
+        help="of the files written (default: obj)",
+    )
     folders.add_argument("--recursive", action="store_true", help="look into subfolders too")
-    folders.add_argument("--jobs", type=_count, default=1, metavar="N",
-                         help="files at a time (default: 1)")  # fmt: skip
+    folders.add_argument(
+        "--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)"
+    )
     return parser
 
 
@@ -123,9 +144,16 @@ def _task(
 ) -> Task:
     threads = max(1, (os.cpu_count() or 1) // options.jobs)
     return Task(
-        source, output, page, options.start, not options.no_cut, options.tolerance,
-        options.checkerboard, threads, options.debug,
-    )  # fmt: skip
+        source,
+        output,
+        page,
+        options.start,
+        not options.no_cut,
+        options.tolerance,
+        options.checkerboard,
+        threads,
+        options.debug,
+    )
 
 
 def _single(options: argparse.Namespace) -> Task:

@@ -240,7 +240,7 @@ def test_only_the_uvs_of_an_obj_change(tmp_path):
     file = read_mesh_file(write(tmp_path, "cube.obj", CUBE))
     write_mesh_file(tmp_path / "out.obj", file, smooth_layout(file))
     lines = (tmp_path / "out.obj").read_text().split("\n")
-    changed = ("f ", "vt ", "mtllib", "usemtl")
+    changed = ("f ", "vt ", "mtllib")
     kept = [line for line in lines if not line.startswith(changed)]
     assert kept == [line for line in CUBE.split("\n") if not line.startswith(changed)]
     faces = [line for line in lines if line.startswith("f ")]
@@ -413,6 +413,18 @@ def test_a_glb_picture_is_read(tmp_path):
     assert paint is not None
     np.testing.assert_array_equal(paint.images[0], gradient(16, 16))
     np.testing.assert_allclose(paint.uv[0], [[0, 0], [1, 0], [1, 1]], atol=1e-6)
+
+
+def test_plain_materials_stay(tmp_path):
+    """Without a picture there is nothing to bake: names and colours are kept as they are."""
+    (tmp_path / "in").mkdir()
+    write(tmp_path / "in", "cube.mtl", "newmtl first\nKd 1 0 0\n")
+    file = read_mesh_file(write(tmp_path / "in", "cube.obj", CUBE))
+    written = write_mesh_file(tmp_path / "out.obj", file, smooth_layout(file))
+    assert [path.name for path in written] == ["out.obj", "out.mtl"]
+    text = written[0].read_text()
+    assert [x for x in text.split("\n") if "mtl" in x] == ["mtllib out.mtl", "usemtl first"]
+    assert trimesh.load_mesh(written[0]).visual.material.diffuse.tolist() == [255, 0, 0, 255]
 
 
 def test_a_missing_picture_is_no_picture(tmp_path):

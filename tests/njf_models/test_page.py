@@ -16,6 +16,7 @@ import igl
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 
 import diffpoisson as dp
@@ -128,6 +129,56 @@ def test_figures_of_a_known_map():
     assert mirrored.flipped == mesh.n_faces
     assert mirrored.area_distortion == mirrored.angle_distortion == mirrored.energy == np.inf
     assert not mirrored.certified
+
+
+def hemispheres() -> tuple[dp.Mesh, dp.UVMap]:
+    """A ball cut along its equator, by hand, its halves laid side by side."""
+    vertices, faces = meshes.sphere(0, 3)
+    mesh = dp.Mesh(vertices, faces)
+    upper = mesh.centroids[:, 2] > mesh.centroids[:, 2].median()
+    cut_faces, charts, pieces = torch.empty_like(mesh.faces), [], []
+    n = 0
+    for k, half in enumerate((upper, ~upper)):
+        disk, index, _ = dp.Mesh.cleaned(mesh.vertices, mesh.faces[half])
+        flat = dp.parameterize(disk)
+        cut_faces[half] = disk.faces + n
+        n += disk.n_vertices
+        faces_of = half.nonzero()[:, 0]
+        (chart,) = flat.charts
+        charts.append(
+            dp.Chart(faces_of, chart.certificate, chart.method, chart.slim_iterations,
+                     chart.milliseconds)
+        )  # fmt: skip
+        uv = flat.uv - flat.uv.amin(0) + torch.tensor([10.0 * k, 0])
+        pieces.append((disk.vertices, uv, (index >= 0).nonzero()[:, 0]))
+    cut, uv, vertex_map = (torch.cat(parts) for parts in zip(*pieces, strict=True))
+    return mesh, dp.UVMap(dp.Mesh(cut, cut_faces), uv, vertex_map, tuple(charts))
+
+
+def test_charts_are_compared_one_by_one_and_stay_in_place():
+    mesh, uvmap = hemispheres()
+    ours, slim, lscm = compare(uvmap, "ours", tolerance=1e-8)
+    assert ours.energy == pytest.approx(uvmap.energy, rel=1e-9)
+    assert slim.energy == pytest.approx(ours.energy, rel=1e-3)  # from the same start
+    areas = uvmap.mesh.areas
+    for chart in uvmap.charts:
+        of_chart = areas[chart.faces]
+        J = dp.jacobians(uvmap.mesh, lscm.uv)[chart.faces]
+        assert float(of_chart @ dp.determinant(J)) == pytest.approx(float(of_chart.sum()))
+        for other in (slim, lscm):
+            corners = uvmap.mesh.faces[chart.faces]
+            there, here = (x.uv[corners].mean((0, 1)) for x in (other, ours))
+            assert (there - here).norm() < 0.2 * float(of_chart.sum()) ** 0.5
+    # The equator was cut once: its length by an independent count.
+    edge_of = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    pairs = np.asarray(edge_of.face_adjacency)
+    chart_of = uvmap.chart_of_face.numpy()
+    crossed = edge_of.face_adjacency_edges[chart_of[pairs[:, 0]] != chart_of[pairs[:, 1]]]
+    ends = mesh.vertices.numpy()[crossed]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
+    assert page.seam_length(mesh, uvmap) == pytest.approx(length)
+    text = page.uv_page("ball", mesh, uvmap, [ours, slim, lscm])
+    assert f"2 charts, {length:.4g} of seams" in text
 
 
 # ------------------------------------------------------- text

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from diffpoisson.certificate import Certificate, certify
-from diffpoisson.chart import flatten_disk
-from diffpoisson.mesh import Mesh
+from diffpoisson import topology
+from diffpoisson.arguments import require_tensor
+from diffpoisson.certificate import Certificate, boxes_apart, certify
+from diffpoisson.flattening import Flattening, flatten_disk
+from diffpoisson.mesh import Mesh, MeshError, require_mesh
+from diffpoisson.packing import pack
+from diffpoisson.parameterization import describe_topology
 from diffpoisson.poisson import PoissonSolver
+from diffpoisson.seams import cut_to_disks
 
+T = TypeVar("T")
 Init = Float[Tensor, "n 2"] | Callable[[Mesh], Tensor]
 
 
@@ -44,25 +52,27 @@ class UVMap:
     """A map of a surface to the plane, in one or more charts, and what is known of it.
 
     Attributes:
-        mesh: the surface cut open: the input's faces in their order, seam vertices repeated; the
-            input itself where nothing was cut.
+        mesh: the surface cut open: the input's faces in their order, seam vertices repeated after
+            all others; the input itself where nothing was cut.
         uv: (n', 2) image of each vertex of `mesh`, in the input's units.
         vertex_map: (n',) int64 the input's vertex that each vertex of `mesh` is a copy of.
         charts: the disks, whose faces are all of the mesh's.
+        overhead: milliseconds of what was not done chart by chart: cutting, packing.
     """
 
     mesh: Mesh
     uv: Float[Tensor, "n 2"]
     vertex_map: Int[Tensor, "n"]
     charts: tuple[Chart, ...]
+    overhead: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def chart_of_face(self) -> Int[Tensor, "m"]:
         """(m,) int64 index of each face's chart."""
-        index = self.mesh.faces.new_empty(self.mesh.n_faces)
-        for i, chart in enumerate(self.charts):
-            index[chart.faces] = i
-        return index
+        sizes = torch.tensor([len(chart.faces) for chart in self.charts])
+        index = torch.arange(len(sizes)).repeat_interleave(sizes).to(self.mesh.device)
+        faces = torch.cat([chart.faces for chart in self.charts])
+        return torch.empty_like(faces).scatter_(0, faces, index)
 
     @property
     def flipped(self) -> int:
@@ -92,11 +102,15 @@ class UVMap:
     @cached_property
     def certified(self) -> bool:
         """Whether the map is one-to-one for certain: every chart is, and their boxes are apart."""
-        return all(chart.certificate.injective for chart in self.charts) and self._boxes_apart()
+        triangles = self.uv[self.mesh.faces].cpu().double().numpy()
+        charts = [triangles[chart.faces.cpu().numpy()] for chart in self.charts]
+        low = np.stack([corners.min(axis=(0, 1)) for corners in charts])
+        high = np.stack([corners.max(axis=(0, 1)) for corners in charts])
+        return all(chart.certificate.injective for chart in self.charts) and boxes_apart(low, high)
 
     @property
     def method(self) -> str:
-        """The stages that its charts came through, each way once, the most frequent first."""
+        """The stages that its charts came through, the most frequent first."""
         return ", ".join(way for way, _ in Counter(c.method for c in self.charts).most_common())
 
     @property
@@ -107,24 +121,15 @@ class UVMap:
     @property
     def milliseconds(self) -> dict[str, float]:
         """Time of each stage that ran, summed over the charts."""
-        total: dict[str, float] = {}
-        for chart in self.charts:
-            for stage, time in chart.milliseconds.items():
-                total[stage] = total.get(stage, 0.0) + time
-        return total
+        total: Counter[str] = Counter()
+        for stages in (self.overhead, *(chart.milliseconds for chart in self.charts)):
+            total.update(stages)
+        return dict(total)
 
     def _mean(self, values: list[float]) -> float:
         """Mean over the charts, by their areas."""
-        areas = [float(self.mesh._double_measures[chart.faces].sum()) for chart in self.charts]
-        return float(np.average(values, weights=areas))
-
-    def _boxes_apart(self) -> bool:
-        """Whether the charts' bounding boxes are disjoint."""
-        corners = [self.uv[self.mesh.faces[chart.faces]].flatten(0, 1) for chart in self.charts]
-        low = torch.stack([points.amin(0) for points in corners])
-        high = torch.stack([points.amax(0) for points in corners])
-        meet = ((low[:, None] <= high) & (low <= high[:, None])).all(-1)
-        return int(meet.sum()) == len(self.charts)
+        areas = self.mesh._double_measures
+        return float(np.average(values, weights=[float(areas[c.faces].sum()) for c in self.charts]))
 
 
 def parameterize(
@@ -132,42 +137,162 @@ def parameterize(
     init: Init | None = None,
     *,
     cut: bool = False,
+    injective: bool = True,
     solver: PoissonSolver | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 500,
 ) -> UVMap:
     """A flip-free map of a surface to the plane with low isometric distortion.
 
-    An initial map with flips is repaired by clamping its singular values, and if that is not enough
-    by untangling. SLIM then descends to a local minimum of the symmetric Dirichlet energy without
-    ever flipping a triangle. Where no map is given, nothing mends it, or it ends up overlapping
-    itself, Tutte's embedding takes its place.
+    Each connected component, cut open if need be, becomes a chart; several charts are packed side
+    by side. An initial map with flips is repaired by clamping its singular values, and if that is
+    not enough by untangling. SLIM then descends to a local minimum of the symmetric Dirichlet
+    energy without ever flipping a triangle. Where no map is given, nothing mends it, or it ends up
+    overlapping itself, Tutte's embedding takes its place.
 
     Args:
-        mesh: a surface in space; a topological disk unless `cut`.
+        mesh: a surface in space, whose components are topological disks unless `cut`.
         init: a map to start from, in the mesh's units, such as a network's: (n, 2) if the mesh is
-            one disk, or a function that is called with the mesh of each chart.
-        cut: cut what is not a disk.
-        solver: a `PoissonSolver` of this mesh whose factor to use; made if it is needed.
+            one disk, or a function that is called with the mesh of each chart and returns its map.
+        cut: cut the surface where topology or low distortion ask for it, see `cut_to_disks`.
+        injective: where SLIM makes a chart overlap itself whatever the start, return the last map
+            before that, of higher distortion. If false, such a map is returned, not certified.
+        solver: a `PoissonSolver` of this mesh whose factor to use, where the mesh is the one chart.
         tolerance: of SLIM, see `slim`.
         max_iterations: of SLIM.
 
     Raises:
-        MeshError: not a disk in space, or too distorted even for Tutte's embedding.
-        ValueError: `init` is not (n, 2) and finite.
+        MeshError: components are not disks and `cut` is false; triangles that no map in the mesh's
+            dtype keeps from flipping.
+        ValueError: an initial map is not (n, 2) and finite, or the mesh is not one disk.
     """
+    _require_surface(mesh)
+    overhead: dict[str, float] = {}
+    surface, vertex_map = mesh, torch.arange(mesh.n_vertices, device=mesh.device)
     if cut:
-        raise NotImplementedError("parameterize: cut=True is under way")
-    start = init(mesh) if callable(init) else init
-    flat = flatten_disk(
-        mesh, start, solver=solver, tolerance=tolerance, max_iterations=max_iterations
+        surface, vertex_map = _timed(overhead, "cut", lambda: cut_to_disks(mesh))
+    parts = _parts(surface)
+    _require_disks(parts)
+    starts = _starts(mesh, vertex_map, parts, init)
+    flats = [
+        flatten_disk(
+            part.mesh if mesh.dtype == torch.float64 else part.mesh.to(torch.float64),
+            start,
+            solver=solver if part.mesh is mesh else None,
+            injective=injective,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+        )
+        for part, start in zip(parts, starts, strict=True)
+    ]
+    uv = _timed(overhead, "pack", lambda: _packed(surface, parts, flats))
+    charts = [_chart(part, flat, uv) for part, flat in zip(parts, flats, strict=True)]
+    uvmap = UVMap(surface, uv, vertex_map, tuple(charts), overhead)
+    _require_flip_free(uvmap)
+    return uvmap
+
+
+class _Part(NamedTuple):
+    """A connected component: its mesh, and its faces and vertices on the surface."""
+
+    mesh: Mesh
+    faces: Int[Tensor, "k"]
+    vertices: Int[Tensor, "n"]
+
+
+def _parts(surface: Mesh) -> list[_Part]:
+    """The components, in the order of their first vertices; the surface itself if it is one."""
+    device = surface.device
+    if surface.n_components == 1:
+        counts = surface.n_faces, surface.n_vertices
+        return [_Part(surface, *(torch.arange(count, device=device) for count in counts))]
+    parts = []
+    for part in topology.connected_parts(surface.faces.cpu().numpy(), surface.n_vertices):
+        cells, vertices, faces = (torch.from_numpy(a).to(device) for a in part)
+        parts.append(_Part(Mesh(surface.vertices[vertices], faces), cells, vertices))
+    return parts
+
+
+def _starts(
+    mesh: Mesh, vertex_map: Tensor, parts: list[_Part], init: Init | None
+) -> list[Tensor | None]:
+    """The initial map of each part in float64, or None."""
+    if init is None:
+        return [None] * len(parts)
+    if callable(init):
+        return [_checked(part.mesh, init(part.mesh)) for part in parts]
+    if not mesh.is_disk:
+        raise ValueError(
+            "parameterize: init belongs to a mesh that is one disk; for other meshes pass a "
+            "function that maps a chart's mesh"
+        )
+    return [_checked(mesh, init)[vertex_map]]
+
+
+def _checked(mesh: Mesh, init: object) -> Tensor:
+    require_tensor("parameterize", "init", init, mesh.device)
+    if init.shape != (mesh.n_vertices, 2):
+        raise ValueError(
+            f"parameterize: expected init of shape (n={mesh.n_vertices}, 2), "
+            f"got {tuple(init.shape)}"
+        )
+    if not torch.isfinite(init).all():
+        raise ValueError("parameterize: init has entries that are not finite; leave it out")
+    return init.detach().double()
+
+
+def _packed(surface: Mesh, parts: list[_Part], flats: list[Flattening]) -> Float[Tensor, "n 2"]:
+    """The maps of the parts, side by side if there are several, in the surface's dtype."""
+    maps = [flat.uv for flat in flats]
+    if len(maps) > 1:
+        maps = [
+            torch.from_numpy(uv).to(flats[0].uv) for uv in pack([m.cpu().numpy() for m in maps])
+        ]
+    uv = surface.vertices.new_empty(surface.n_vertices, 2)
+    uv[torch.cat([part.vertices for part in parts])] = torch.cat(maps).to(uv)
+    return uv
+
+
+def _chart(part: _Part, flat: Flattening, uv: Float[Tensor, "n 2"]) -> Chart:
+    milliseconds = dict(flat.milliseconds)
+    certificate = _timed(milliseconds, "certify", lambda: certify(part.mesh, uv[part.vertices]))
+    return Chart(part.faces, certificate, flat.method, flat.slim_iterations, milliseconds)
+
+
+# -------------------------------------------------------------------- what is refused
+
+
+def _require_surface(mesh: object) -> None:
+    require_mesh("parameterize", mesh)
+    if (mesh.cell_dim, mesh.dim) != (2, 3):
+        kind = "tetrahedra" if mesh.cell_dim == 3 else f"vertices with D = {mesh.dim}"
+        raise MeshError(f"parameterize: maps surfaces in space to the plane, got {kind}")
+
+
+def _require_disks(parts: list[_Part]) -> None:
+    others = [(i, part.mesh) for i, part in enumerate(parts) if not part.mesh.is_disk]
+    if not others:
+        return
+    named = [f"component {i} of {len(parts)} has {describe_topology(m)}" for i, m in others[:3]]
+    more = f", and {len(others) - 3} more components" if len(others) > 3 else ""
+    raise MeshError(
+        f"parameterize: needs topological disks, but {'; '.join(named)}{more}; "
+        "parameterize(mesh, cut=True) cuts them open"
     )
-    chart = Chart(
-        torch.arange(mesh.n_faces, device=mesh.device),
-        certify(mesh, flat.uv),
-        flat.method,
-        flat.slim_iterations,
-        flat.milliseconds,
-    )
-    vertex_map = torch.arange(mesh.n_vertices, device=mesh.device)
-    return UVMap(mesh, flat.uv, vertex_map, (chart,))
+
+
+def _require_flip_free(uvmap: UVMap) -> None:
+    """Charts are flip-free in float64; moving or rounding them can collapse small triangles."""
+    if uvmap.flipped:
+        raise MeshError(
+            f"parameterize: rounding the map to {uvmap.mesh.dtype} flips {uvmap.flipped} of "
+            f"{uvmap.mesh.n_faces} faces; use mesh.to(torch.float64), or map the components alone"
+        )
+
+
+def _timed(milliseconds: dict[str, float], stage: str, work: Callable[[], T]) -> T:
+    """The result of some work, whose time is kept."""
+    start = time.perf_counter()
+    result = work()
+    milliseconds[stage] = 1000 * (time.perf_counter() - start)
+    return result

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import diffpoisson as dp
-from njf_models.objfile import ObjFile, obj_text, parse_obj, plain_obj
+from njf_models.objfile import ObjFile, obj_text, parse_obj, plain_obj, whole_polygons
 from njf_models.texture import Paint, bake
 
 READABLE = (".glb", ".obj", ".off", ".ply", ".stl")
@@ -268,6 +268,11 @@ def _usable_corner(vertex_map: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """For each face, the cleaned mesh's index of one of its corners, -1 where none is in it."""
     in_range = (faces >= 0) & (faces < len(vertex_map))
     return np.where(in_range, vertex_map[np.where(in_range, faces, 0)], -1).max(axis=1, initial=-1)
+
+
+def count_crossed_polygons(file: MeshFile, layout: Layout) -> int:
+    """Polygons of an OBJ that seams cross, which are written as triangles."""
+    return 0 if file.obj is None else int((~whole_polygons(file.obj, layout.corners)).sum())
 
 
 def write_mesh_file(

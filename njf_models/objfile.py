@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from njf_models.polygons import triangulated
 
@@ -125,7 +125,8 @@ def obj_text(
         library: name of the MTL file to use instead of its own.
         material: one for all polygons instead of their own.
     """
-    new_corner, whole = _texcoord_of_corner(obj, triangle_texcoords)
+    new_corner = _texcoord_of_corner(obj, triangle_texcoords)
+    whole = whole_polygons(obj, triangle_texcoords)
     start = np.concatenate([[0], np.cumsum(obj.sizes)])
     first_triangle = np.searchsorted(obj.polygon_of_triangle, np.arange(len(obj.sizes) + 1))
     polygon_at = dict(zip(obj.line_of_polygon.tolist(), range(len(obj.sizes)), strict=True))
@@ -207,14 +208,19 @@ def _require_range(corners: np.ndarray, n_vertices: int, n_texcoords: int) -> No
             raise ValueError(f"a face uses {noun} {largest + 1}, but there are {count}")
 
 
-def _texcoord_of_corner(
-    obj: ObjFile, triangle_texcoords: np.ndarray
-) -> tuple[Int[np.ndarray, "c"], np.ndarray]:
-    """New index of each corner, and whether the triangles of each polygon agree on them."""
-    corner, index = obj.triangles.ravel(), triangle_texcoords.ravel()
-    new = np.full(len(obj.corners), -1)
-    new[corner] = index
-    polygon = np.repeat(obj.polygon_of_triangle, 3)
+def whole_polygons(
+    obj: ObjFile, triangle_texcoords: Int[np.ndarray, "m 3"]
+) -> Bool[np.ndarray, "p"]:
+    """Whether no seam crosses a polygon: its triangles agree on its corners' coordinates."""
+    new = _texcoord_of_corner(obj, triangle_texcoords)
+    differs = (new[obj.triangles] != triangle_texcoords).any(axis=1)
     whole = np.ones(len(obj.sizes), dtype=bool)
-    whole[polygon[new[corner] != index]] = False
-    return new, whole
+    whole[obj.polygon_of_triangle[differs]] = False
+    return whole
+
+
+def _texcoord_of_corner(obj: ObjFile, triangle_texcoords: np.ndarray) -> Int[np.ndarray, "c"]:
+    """New index of each corner, by one of the triangles it is in."""
+    new = np.full(len(obj.corners), -1)
+    new[obj.triangles] = triangle_texcoords
+    return new

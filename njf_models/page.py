@@ -210,9 +210,9 @@ def _length(mesh: dp.Mesh, edges: Int[np.ndarray, "b 2"]) -> float:
 
 
 def _colour_limit(maps: Sequence[MeasuredMap]) -> float:
-    """The least candidate that leaves one face in a hundred of the first map beyond the scale."""
+    """The least candidate that leaves one face in twenty of the first map beyond the scale."""
     distortion = maps[0].distortion.numpy()
-    reached = np.quantile(distortion, 0.99, method="inverted_cdf")
+    reached = np.quantile(distortion, 0.95, method="inverted_cdf")
     return next((limit for limit in _LIMITS if reached <= limit), _LIMITS[-1])
 
 

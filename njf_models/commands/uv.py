@@ -218,6 +218,7 @@ def _convert(task: Task) -> dict[str, Any]:
             task.output, file, layout, checkerboard=task.checkerboard
         )
         record |= {"output": str(task.output), "files": [path.name for path in written]}
+        record["notes"] += _notes_on_output(file, layout, task.output.suffix.lower())
     if task.report is not None:
         record["report"] = str(task.report)
         _write_report(task, cleaned.mesh, uvmap)
@@ -239,8 +240,6 @@ def _parameterize(mesh: Any, task: Task) -> Any:
 def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:
     dropped = len(file.faces) - cleaned.mesh.n_faces
     notes = [f"{dropped:,} triangles without area have no UVs of their own"] if dropped else []
-    if file.paint is not None:
-        notes.append("pictures were baked for the new UVs")
     return {
         "vertices": len(file.vertices),
         "triangles": len(file.faces),
@@ -255,6 +254,18 @@ def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:
         "milliseconds": {stage: round(t, 3) for stage, t in uvmap.milliseconds.items()},
         "notes": notes,
     }
+
+
+def _notes_on_output(file: Any, layout: Any, suffix: str) -> list[str]:
+    """What is not as it was, apart from the UVs."""
+    from njf_models.meshfiles import count_crossed_polygons  # noqa: PLC0415
+
+    notes = []
+    if file.paint is not None:
+        notes.append("pictures were baked into one for the new UVs")
+    if suffix == ".obj" and (crossed := count_crossed_polygons(file, layout)):
+        notes.append(f"{crossed:,} polygons that seams cross were written as triangles")
+    return notes
 
 
 def _write_report(task: Task, mesh: Any, uvmap: Any) -> None:

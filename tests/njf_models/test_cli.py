@@ -186,6 +186,41 @@ def torch_double(values: np.ndarray) -> dp.mesh.Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
 
 
+def test_a_closed_mesh_is_cut_in_its_uvs_only(tmp_path, capsys):
+    """Two components: vertices and quads of the OBJ as they were, more UVs than vertices."""
+    ball, disk = meshes.sphere(), meshes.disk(0, 5)
+    both = meshes.union(ball, disk)
+    lines = ["v {} {} {}".format(*v) for v in both[0].tolist()]
+    lines += ["f {} {} {}".format(*(f + 1)) for f in both[1]]
+    source, output = tmp_path / "two.obj", tmp_path / "out.obj"
+    source.write_text("\n".join(lines))
+    assert tutte(source, output) == 0
+    assert re.search(r"[2-9] charts .* 0 flipped  certified", capsys.readouterr().out)
+    written = output.read_text().split("\n")
+    assert [line for line in written if line.startswith("v ")] == lines[: len(both[0])]
+    corners = [line.split()[1:] for line in written if line.startswith("f ")]
+    vertex, texcoord = np.array([[word.split("/") for word in f] for f in corners], dtype=int).T
+    np.testing.assert_array_equal(vertex.T, both[1] + 1)
+    pairs = np.unique(np.stack([vertex.ravel(), texcoord.ravel()]), axis=1)
+    count = np.bincount(pairs[0])[1:]
+    assert (count[: len(ball[0])] > 1).any()  # seams
+    assert len({*pairs[1]}) == len(pairs[1])  # no UV is shared between vertices
+
+
+def test_quads_that_seams_cross_are_counted(tmp_path, capsys):
+    box = (
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"
+        "f 1 4 3 2\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"
+    )
+    (tmp_path / "box.obj").write_text(box)
+    assert tutte(tmp_path / "box.obj", tmp_path / "out.obj") == 0
+    faces = [x for x in (tmp_path / "out.obj").read_text().split("\n") if x.startswith("f ")]
+    crossed = sum(len(face.split()) == 4 for face in faces) // 2
+    assert crossed + sum(len(face.split()) == 5 for face in faces) == 6
+    note = f"{crossed} polygons that seams cross were written as triangles"
+    assert (note in capsys.readouterr().out) == (crossed > 0)
+
+
 def test_json_to_stdout_is_all_there_is(disk, capsys):
     assert tutte(disk, "--json", "-") == 0
     printed = capsys.readouterr()

@@ -58,7 +58,7 @@ def uv_page(
         "ramp": f"linear-gradient(90deg, {', '.join(_VIRIDIS)})",
         "ticks": _ticks(limit),
         "simplified": _simplified_note(len(shown[0]), mesh.n_faces),
-        "histogram": histogram(maps, uvmap.mesh.areas.numpy(), max(limit, 2.0)),
+        "histogram": histogram(maps, uvmap.mesh.areas.numpy(), max(limit, 1.5)),
         "flips_note": f" Flipped triangles ({html.escape(', '.join(flipped_maps))}) are not in it."
         if flipped_maps
         else "",

@@ -51,9 +51,19 @@ def run(options: argparse.Namespace) -> int:
         print(json.dumps(facts, indent=1, allow_nan=False))
         return int(failed)
     if options.json:
-        Path(options.json).write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n")
+        _write(Path(options.json), json.dumps(facts, indent=1, allow_nan=False) + "\n")
     print("\n\n".join(_text(name, values) for name, values in facts.items()))
     return int(failed)
+
+
+def _write(path: Path, text: str) -> None:
+    from njf_models.meshfiles import whole_file  # noqa: PLC0415  (slow import)
+
+    try:
+        with whole_file(path) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"{path}: {error.strerror}") from error
 
 
 def _facts(name: str) -> dict[str, Any]:

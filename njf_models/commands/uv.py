@@ -9,7 +9,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -232,6 +231,8 @@ def _parameterize(mesh: Any, task: Task) -> Any:
         return dp.parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
     try:
         from njf_models import parameterize  # noqa: PLC0415
+    except ModuleNotFoundError:
+        raise
     except ImportError as error:
         raise CommandError("this version has no trained network: use --start tutte") from error
     return parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
@@ -412,10 +413,13 @@ def _write_json(records: list[dict[str, Any]], failed: int, where: str) -> None:
     if where == "-":
         sys.stdout.write(text)
         return
-    path = Path(where)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".njf-") as folder:
-        (Path(folder) / path.name).write_text(text, encoding="utf-8")
-        (Path(folder) / path.name).replace(path)
+    from njf_models.meshfiles import whole_file  # noqa: PLC0415
+
+    try:
+        with whole_file(Path(where)) as path:
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"{where}: {error.strerror}") from error
 
 
 def _finite(value: Any) -> Any:

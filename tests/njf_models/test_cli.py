@@ -278,6 +278,30 @@ def test_a_place_that_cannot_be_written(disk, tmp_path, capsys):
     assert error.count("\n") == 1
 
 
+def test_a_place_for_json_that_cannot_be_written(disk, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for command in ("uv", "info"):
+        start = ["--start", "tutte"] if command == "uv" else []
+        assert main([command, str(disk), "--json", str(tmp_path / "file" / "a.json"), *start]) == 1
+        (line,) = capsys.readouterr().err.strip().split("\n")
+        assert line.startswith(f"njf {command}: {tmp_path}/file/a.json: ")
+
+
+def test_the_network_is_the_default(disk, monkeypatch, capsys):
+    import njf_models
+
+    calls = []
+
+    def parameterize(mesh: dp.Mesh, **options: object) -> dp.UVMap:
+        calls.append(options)
+        return dp.parameterize(mesh)
+
+    monkeypatch.setattr(njf_models, "parameterize", parameterize, raising=False)
+    assert main(["uv", str(disk)]) == 0
+    assert main(["uv", str(disk), "--no-cut", "--tolerance", "1e-3"]) == 0
+    assert calls == [{"cut": True, "tolerance": 1e-6}, {"cut": False, "tolerance": 1e-3}]
+
+
 # ------------------------------------------------------- folders
 
 

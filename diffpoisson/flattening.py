@@ -21,15 +21,14 @@ class Flattening(NamedTuple):
 
     Attributes:
         uv: (n, 2) the map, in the mesh's units.
-        energy: its area-weighted mean symmetric Dirichlet energy.
         simple: whether its boundary does not meet itself.
-        method: the stages it came through, such as "init", "init+clamp" or "tutte", before SLIM.
+        method: the stages it came through, such as "init+clamp" or "tutte", before SLIM; ending in
+            "scaffold" where that kept it from overlapping itself.
         slim_iterations: iterations of the final polish.
         milliseconds: time of each stage that ran.
     """
 
     uv: Float[Tensor, "n 2"]
-    energy: float
     simple: bool
     method: str
     slim_iterations: int
@@ -48,48 +47,25 @@ def flatten_disk(
 
     Args:
         mesh: a disk in space.
-        init: (n, 2) finite map to start from.
+        init: (n, 2) finite map to start from; Tutte's takes its place if nothing mends it.
         solver: of the mesh, made if it is needed.
-        injective: where both the initial and Tutte's map end up overlapping themselves, stop SLIM
-            before that.
+        injective: keep the map from overlapping itself.
         polish: options of `slim`.
     """
-    candidates = []
+    stages = _Stages(mesh)
     if init is not None:
-        stages = _Stages(mesh)
-        _repair(stages, init, solver)
-        if not count_flips(mesh, stages.uv):
-            candidates.append(_polished(stages, **polish))
-    if not any(candidate.simple for candidate in candidates):
-        stages = _Stages(mesh)
-        stages.start("tutte", lambda: tutte(mesh))
-        candidates.append(_polished(stages, **polish))
-    if injective and not any(candidate.simple for candidate in candidates):
-        candidates = [_polished(stages, injective=True, **polish)]
-    return min(candidates, key=lambda candidate: (not candidate.simple, candidate.energy))
-
-
-def _repair(stages: _Stages, init: Tensor, solver: PoissonSolver | None) -> None:
-    mesh = stages.mesh
-    stages.start("init", lambda: init)
-    if count_flips(mesh, stages.uv):
-        stages.run("clamp", lambda uv: clamp_flips(solver or PoissonSolver(mesh), uv)[0])
-    if count_flips(mesh, stages.uv):
-        stages.run("untangle", lambda uv: untangle(mesh, uv)[0])
-
-
-def _polished(stages: _Stages, **options: Any) -> Flattening:
-    """The map after SLIM."""
-    result: SlimResult = stages.timed("slim", lambda: slim(stages.mesh, stages.uv, **options))
-    boundary = result.uv[stages.mesh.boundary_loops[0]]
-    return Flattening(
-        uv=result.uv,
-        energy=result.energies[-1],
-        simple=is_simple(boundary.cpu().double().numpy()),
-        method="+".join(stages.passed),
-        slim_iterations=len(result.energies) - 1,
-        milliseconds=stages.milliseconds,
-    )
+        stages.start("init", lambda: init)
+        if stages.flips:
+            stages.run("clamp", lambda uv: clamp_flips(solver or PoissonSolver(mesh), uv)[0])
+        if stages.flips:
+            stages.run("untangle", lambda uv: untangle(mesh, uv)[0])
+        if not stages.flips:
+            # Where it starts with an overlap, SLIM may still undo that.
+            flattening = stages.polished(injective=injective and stages.simple, **polish)
+            if flattening.simple or not injective:
+                return flattening
+    stages.start("tutte", lambda: tutte(mesh))
+    return stages.polished(injective=injective, **polish)
 
 
 class _Stages:
@@ -100,6 +76,16 @@ class _Stages:
         self.uv: Tensor = mesh.vertices.new_zeros(0, 2)
         self.passed: list[str] = []
         self.milliseconds: dict[str, float] = {}
+
+    @property
+    def flips(self) -> bool:
+        """Whether the map has a triangle that is not positively oriented."""
+        return count_flips(self.mesh, self.uv) > 0
+
+    @property
+    def simple(self) -> bool:
+        """Whether the map's boundary does not meet itself."""
+        return is_simple(self.uv[self.mesh.boundary_loops[0]].cpu().double().numpy())
 
     def start(self, name: str, make: Callable[[], Tensor]) -> None:
         """Begin with a map."""
@@ -117,3 +103,17 @@ class _Stages:
         spent = 1000 * (time.perf_counter() - start)
         self.milliseconds[name] = self.milliseconds.get(name, 0.0) + spent
         return result
+
+    def polished(self, **options: Any) -> Flattening:
+        """The map after SLIM."""
+        result: SlimResult = self.timed("slim", lambda: slim(self.mesh, self.uv, **options))
+        self.uv = result.uv
+        if result.scaffolded:
+            self.passed.append("scaffold")
+        return Flattening(
+            uv=self.uv,
+            simple=self.simple,
+            method="+".join(self.passed),
+            slim_iterations=len(result.energies) - 1,
+            milliseconds=self.milliseconds,
+        )

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import igl
 import numpy as np
@@ -46,11 +46,13 @@ class SlimResult(NamedTuple):
         uv: (n, 2) flip-free map in the mesh's own units, dtype and device.
         energies: mean symmetric Dirichlet energy of the initial map and after each iteration.
         converged: whether the last iteration's relative decrease was within the tolerance.
+        scaffolded: whether a scaffold kept the map from overlapping itself.
     """
 
     uv: Tensor
     energies: list[float]
     converged: bool
+    scaffolded: bool
 
 
 def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
@@ -106,49 +108,101 @@ def slim(
         init: (n, 2) flip-free map, in the mesh's units: its scale counts, since isometries are
             sought.
         tolerance: stop when an iteration lowers the energy by less than this fraction of it.
-        max_iterations: give up then, with `converged` False.
-        injective: return the last iterate whose boundary does not meet itself. SLIM keeps triangles
-            from flipping, but not the map from overlapping itself.
+        max_iterations: give up then, with `converged` False; also of the scaffold.
+        injective: keep the boundary from meeting itself, too. Where SLIM ends with an overlap, go
+            on from its last iterate that has none, with the outside of the map triangulated: a
+            scaffold that must not flip either (Jiang et al. 2017).
 
     Raises:
-        MeshError: not a disk in space; `init` flips faces, from which SLIM cannot start; or
-            rounding to the mesh's dtype flips faces.
-        RuntimeError: libigl produced flips, as rounding can on nearly degenerate faces.
+        MeshError: not a disk in space; `init` flips faces or, if `injective`, its boundary meets
+            itself, which the method cannot undo; or rounding to the mesh's dtype flips faces.
 
     References:
         Rabinovich, Poranne, Panozzo and Sorkine-Hornung, "Scalable locally injective mappings",
-        2017.
+        2017. Jiang, Schaefer and Panozzo, "Simplicial complex augmentation framework for bijective
+        maps", 2017.
     """
     _require_disk("slim", mesh)
     require_number("slim", "tolerance", tolerance)
     require_integer("slim", "max_iterations", max_iterations, least=0)
     _require_init(mesh, init)
     boundary = mesh.boundary_loops[0].cpu().numpy()
-    mean_energy = _mean_energy(mesh)
-    points = init.cpu().double().numpy()
-    energies, kept, converged = [mean_energy(points)], (points, 1), False
-    _require_start(mesh, init, energies[0])
-    iterates = _slim_iterates(mesh, points)
-    for points in islice(iterates, max_iterations):
-        energies.append(mean_energy(points))
-        converged = energies[-2] - energies[-1] <= tolerance * energies[-1]
-        if not injective or is_simple(points[boundary]):
-            kept = points, len(energies)
-        if converged:
-            break
-    points, count = kept
-    return SlimResult(
-        _rounded(mesh, points), energies[:count], converged and count == len(energies)
+    descent = _Descent(
+        mean_energy=_mean_energy(mesh),
+        admits=lambda points: not injective or is_simple(points[boundary]),
+        tolerance=tolerance,
+        points=init.cpu().double().numpy(),
     )
+    _require_start(mesh, init, descent)
+    converged = descent.follow(_slim_iterates(mesh, descent.points), max_iterations)
+    overlaps = not descent.admitted_last
+    if overlaps:
+        iterates = _scaffold_iterates(mesh, descent.points)
+        converged = descent.follow(iterates, max_iterations, patience=3)
+    return SlimResult(_rounded(mesh, descent.points), descent.energies, converged, overlaps)
+
+
+class _Descent:
+    """The best admissible map so far, and the energies on the way there."""
+
+    def __init__(
+        self,
+        mean_energy: Callable[[np.ndarray], float],
+        admits: Callable[[np.ndarray], bool],
+        tolerance: float,
+        points: Float[np.ndarray, "n 2"],
+    ) -> None:
+        self.mean_energy, self.admits, self.tolerance = mean_energy, admits, tolerance
+        self.points, self.energies = points, [mean_energy(points)]
+        self.admitted_last = True
+
+    def follow(
+        self, iterates: Iterator[np.ndarray], max_iterations: int, patience: int = 1
+    ) -> bool:
+        """Follow iterates until their energy falls no more; whether it came to that."""
+        trail = list(self.energies)
+        for points in islice(iterates, max_iterations):
+            trail.append(self.mean_energy(points))
+            self.admitted_last = trail[-1] <= self.energies[-1] and self.admits(points)
+            if self.admitted_last:
+                self.points, self.energies = points, list(trail)
+            if not trail[-1] < math.inf:  # rounding, on nearly degenerate faces
+                return False
+            if trail[-1 - patience :][0] - trail[-1] <= self.tolerance * trail[-1]:
+                return True
+        return False
 
 
 def _slim_iterates(
     mesh: Mesh, points: Float[np.ndarray, "n 2"]
 ) -> Iterator[Float[np.ndarray, "n 2"]]:
-    """The maps after one, two, … iterations."""
-    # libigl's proximal term (1e-4 I) is absolute: only at a fixed scale does it mean the same.
+    """The maps after one, two, … iterations of SLIM."""
+    arguments, scale = _libigl_arguments(mesh, points)
+    data = igl.slim_precompute(*arguments)
+    while True:
+        yield scale * np.ascontiguousarray(igl.slim_solve(data, 1)[:, :2])
+
+
+def _scaffold_iterates(
+    mesh: Mesh, points: Float[np.ndarray, "n 2"]
+) -> Iterator[Float[np.ndarray, "n 2"]]:
+    """The same with a scaffold."""
+    # Only where it is needed: it links Shewchuk's Triangle, whose licence has conditions.
+    from igl import triangle  # noqa: PLC0415
+
+    arguments, scale = _libigl_arguments(mesh, points)
+    data = triangle.SCAFData()
+    triangle.scaf_precompute(*arguments, data)
+    while True:
+        moved = triangle.scaf_solve(1, data)[: mesh.n_vertices, :2]
+        yield scale * np.ascontiguousarray(moved)
+
+
+def _libigl_arguments(mesh: Mesh, points: np.ndarray) -> tuple[tuple[Any, ...], float]:
+    """What libigl's methods take, at a scale of area one, and the unit of that scale."""
+    # Their proximal term (1e-4 I) is absolute: only at a fixed scale does it mean the same.
     scale = math.sqrt(float(mesh._double_measures.sum()))
-    data = igl.slim_precompute(
+    return (
         np.asfortranarray(mesh.vertices.cpu().double().numpy() / scale),
         np.asfortranarray(mesh.faces.cpu().numpy(), dtype=np.int32),
         np.asfortranarray(points / scale),
@@ -156,9 +210,7 @@ def _slim_iterates(
         np.zeros(0, dtype=np.int32),  # no soft constraints
         np.zeros((0, 2), order="F"),
         0.0,
-    )
-    while True:
-        yield scale * np.ascontiguousarray(igl.slim_solve(data, 1)[:, :2])
+    ), scale
 
 
 def procrustes(
@@ -264,14 +316,10 @@ def _mean_energy(mesh: Mesh) -> Callable[[Float[np.ndarray, "n 2"]], float]:
 def _rounded(mesh: Mesh, points: Float[np.ndarray, "n 2"]) -> Float[Tensor, "n 2"]:
     """The map in the mesh's dtype, which must still be flip-free."""
     uv = torch.from_numpy(points).to(mesh.vertices)
-    if (n_flipped := count_flips(mesh, uv)) and not count_flips(mesh, torch.from_numpy(points)):
+    if n_flipped := count_flips(mesh, uv):
         raise MeshError(
-            f"slim: rounding to {mesh.dtype} flips {n_flipped} of {mesh.n_faces} faces; use float64"
-        )
-    if n_flipped:
-        raise RuntimeError(
-            f"slim: libigl returned {n_flipped} of {mesh.n_faces} faces flipped; the mesh has "
-            "nearly degenerate faces: remesh it"
+            f"slim: rounding to {mesh.dtype} flips {n_flipped} of {mesh.n_faces} faces, which are "
+            "nearly degenerate; use float64, or remesh them"
         )
     return uv
 
@@ -287,12 +335,17 @@ def _require_init(mesh: Mesh, init: Tensor) -> None:
         )
 
 
-def _require_start(mesh: Mesh, init: Tensor, energy: float) -> None:
-    if not math.isfinite(energy):
+def _require_start(mesh: Mesh, init: Tensor, descent: _Descent) -> None:
+    if not descent.energies[0] < math.inf:
         count = int(flipped(jacobians(mesh, init)).sum())
         raise MeshError(
             f"slim: init flips {count} of {mesh.n_faces} faces, and SLIM keeps the signs it starts "
             "with; start from tutte(mesh)"
+        )
+    if not descent.admits(descent.points):
+        raise MeshError(
+            "slim: the boundary of init meets itself, so that nothing keeps the map injective; "
+            "start from tutte(mesh)"
         )
 
 

@@ -35,7 +35,8 @@ class Chart:
     Attributes:
         faces: (k,) int64 indices of its faces, ascending.
         certificate: exact facts and distortion.
-        method: the stages it came through, such as "init", "init+clamp" or "tutte", before SLIM.
+        method: the stages it came through, such as "init+clamp" or "tutte", before SLIM; ending in
+            "scaffold" where that kept it from overlapping itself.
         slim_iterations: iterations of the final polish.
         milliseconds: time of each stage that ran.
     """

@@ -30,7 +30,8 @@ def _lying(points: np.ndarray) -> np.ndarray:
 
     One side of such a box lies on an edge of the convex hull (Freeman and Shapira 1975).
     """
-    hull = points[scipy.spatial.ConvexHull(points).vertices]
+    # Joggled, since slivers are flat to Qhull: the hull only supplies directions.
+    hull = points[scipy.spatial.ConvexHull(points, qhull_options="QJ").vertices]
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     length = np.hypot(x, y)
     turns = np.array([[x, y], [-y, x]]) / length  # (2, 2, edges): each edge to the x-axis

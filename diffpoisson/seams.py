@@ -126,7 +126,7 @@ def _local_global(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n 2"]:
     """Descend on the ARAP energy: fit rotations to the Jacobians, a map to the rotations."""
     solver = PoissonSolver(mesh)
     for _ in range(_LOCAL_GLOBAL_ITERATIONS):
-        uv = solver(clamp_singular_values(jacobians(mesh, uv), 1, 1))
+        uv = solver(clamp_singular_values(jacobians(mesh, uv), 1.0, 1.0))
     return uv
 
 

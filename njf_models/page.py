@@ -245,15 +245,19 @@ def histogram(
     """
     edges = np.linspace(0, math.log(limit), bins + 1)
     shares = [_shares(m.distortion.numpy(), areas, edges) for m in maps]
-    largest = max(float(share.max()) for share in shares) or 1.0  # zero if all is flipped
-    outlines = [_steps(100 * (1 - share / largest)) for share in shares]
+    # The last bin may outgrow the others by far: it is cut off at their height, its share written.
+    largest = max(float(share[:-1].max()) for share in shares) or 1.0  # zero if none are in range
+    outlines = [_steps(100 * np.maximum(1 - share / largest, 0)) for share in shares]
     groups = "".join(
         f'<g class="map-{i}"><polygon class="area" points="0,100 {points} {bins + 1},100"/>'
         f'<polyline class="outline" points="{points}"/></g>'
         for i, points in enumerate(outlines)
     )
     titles = [html.escape(m.title) for m in maps]
-    key = "".join(f'<li class="map-{i}"><i></i>{title}</li>' for i, title in enumerate(titles))
+    key = "".join(
+        f'<li class="map-{i}"><i></i>{title}, {100 * share[-1]:.3g}% beyond {limit:g}</li>'
+        for i, (title, share) in enumerate(zip(titles, shares, strict=True))
+    )
     return (
         f'<ul class="key">{key}</ul>\n<div class="histogram"><svg viewBox="0 0 {bins + 1} 100" '
         f'preserveAspectRatio="none" role="img" aria-label="Histogram: {", ".join(titles)}">'

@@ -254,6 +254,22 @@ def test_the_histogram_counts_all_area(mapped):
         assert shares[k] == pytest.approx(areas[inside].sum() / areas.sum())
 
 
+def test_the_histogram_is_drawn_to_scale():
+    """Half the area in the first bin, a quarter in the second, a quarter beyond the axis."""
+    mesh = bump(5)
+    assert mesh.n_faces == 32
+    distortion = torch.ones(32)
+    distortion[16:24], distortion[24:] = 1.6, 9.0
+    known = MeasuredMap(
+        "known", mesh.vertices[:, :2], distortion, *[1.0] * 5, 0, 0, certified=True, milliseconds={}
+    )
+    drawn = page.histogram([known], np.ones(32), limit=4.0, bins=4)
+    (points,) = re.findall(r'<polyline class="outline" points="([^"]*)"', drawn)
+    heights = [100 - float(pair.split(",")[1]) for pair in points.split()][::2]
+    assert heights == pytest.approx([100, 50, 0, 0, 50])
+    assert "known, 25% beyond 4" in drawn
+
+
 def test_the_views_show_this_map(text, mapped):
     mesh, uvmap, maps = mapped
     data = views(text)

@@ -77,13 +77,9 @@ def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
         surface triangulations", 1997.
     """
     _require_disk("tutte", mesh)
-    boundary = mesh.boundary_loops[0]
-    circle = _circle(mesh, boundary)
-    # Obtuse angles make cotangents negative, so that this Laplacian can fail to give an embedding,
-    # but it is positive definite on the interior whatever the angles.
-    uv = _harmonic_extension(laplacian(mesh), boundary, circle).to(mesh.vertices)
+    uv = harmonic_disk(mesh)
     if flipped(jacobians(mesh, uv)).any():
-        uv = _harmonic_extension(_graph_laplacian(mesh), boundary, circle).to(mesh.vertices)
+        uv = _extended_from_circle(mesh, _graph_laplacian(mesh))
         n_flipped = int(flipped(jacobians(mesh, uv)).sum())
         if n_flipped:
             raise MeshError(
@@ -91,6 +87,15 @@ def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
                 "shrank too far; use float64, or cut the surface into flatter pieces"
             )
     return uv
+
+
+def harmonic_disk(mesh: Mesh) -> Float[Tensor, "n 2"]:
+    """The harmonic map of a disk onto a round disk of the same area, see `tutte`; it may flip.
+
+    Obtuse angles make cotangents negative, so that the cotangent Laplacian can fail to give an
+    embedding, but it is positive definite on the interior whatever the angles.
+    """
+    return _extended_from_circle(mesh, laplacian(mesh))
 
 
 def slim(
@@ -135,11 +140,10 @@ def slim(
     )
     _require_start(mesh, init, descent)
     converged = descent.follow(_slim_iterates(mesh, descent.points), max_iterations)
-    overlaps = not descent.admitted_last
-    if overlaps:
+    if scaffolded := not descent.admitted:
         iterates = _scaffold_iterates(mesh, descent.points)
         converged = descent.follow(iterates, max_iterations, patience=3)
-    return SlimResult(_rounded(mesh, descent.points), descent.energies, converged, overlaps)
+    return SlimResult(_rounded(mesh, descent.points), descent.energies, converged, scaffolded)
 
 
 class _Descent:
@@ -154,7 +158,7 @@ class _Descent:
     ) -> None:
         self.mean_energy, self.admits, self.tolerance = mean_energy, admits, tolerance
         self.points, self.energies = points, [mean_energy(points)]
-        self.admitted_last = True
+        self.admitted = admits(points)  # whether the last iterate was
 
     def follow(
         self, iterates: Iterator[np.ndarray], max_iterations: int, patience: int = 1
@@ -163,11 +167,11 @@ class _Descent:
         trail = list(self.energies)
         for points in islice(iterates, max_iterations):
             trail.append(self.mean_energy(points))
-            self.admitted_last = trail[-1] <= self.energies[-1] and self.admits(points)
-            if self.admitted_last:
-                self.points, self.energies = points, list(trail)
             if not trail[-1] < math.inf:  # rounding, on nearly degenerate faces
                 return False
+            self.admitted = self.admits(points)
+            if self.admitted and trail[-1] <= self.energies[-1]:
+                self.points, self.energies = points, list(trail)
             if trail[-1 - patience :][0] - trail[-1] <= self.tolerance * trail[-1]:
                 return True
         return False
@@ -270,17 +274,16 @@ def _circle(mesh: Mesh, boundary: Tensor) -> Float[Tensor, "b 2"]:
     return radius * torch.stack([angle.cos(), angle.sin()], dim=1)
 
 
-def _harmonic_extension(
-    L: sp.csr_matrix, boundary: Tensor, values: Float[Tensor, "b c"]
-) -> Float[Tensor, "n c"]:
-    """u with u = values on the boundary and (L u)ᵢ = 0 at every other vertex i."""
-    u = torch.zeros(L.shape[0], values.shape[1], dtype=torch.float64)
-    u[boundary.cpu()] = values.cpu()
-    interior = np.setdiff1d(np.arange(L.shape[0]), boundary.cpu().numpy())
+def _extended_from_circle(mesh: Mesh, L: sp.csr_matrix) -> Float[Tensor, "n 2"]:
+    """u on the circle at the boundary, with (L u)ᵢ = 0 at every other vertex i."""
+    boundary = mesh.boundary_loops[0]
+    u = torch.zeros(mesh.n_vertices, 2, dtype=torch.float64)
+    u[boundary.cpu()] = _circle(mesh, boundary).cpu()
+    interior = np.setdiff1d(np.arange(mesh.n_vertices), boundary.cpu().numpy())
     if len(interior):
         rhs = torch.from_numpy(-(L @ u.numpy())[interior])
         u[interior] = CholeskyFactor(L[interior][:, interior]).multiply(rhs)
-    return u
+    return u.to(mesh.vertices)
 
 
 def _graph_laplacian(mesh: Mesh) -> sp.csr_matrix:
@@ -342,7 +345,7 @@ def _require_start(mesh: Mesh, init: Tensor, descent: _Descent) -> None:
             f"slim: init flips {count} of {mesh.n_faces} faces, and SLIM keeps the signs it starts "
             "with; start from tutte(mesh)"
         )
-    if not descent.admits(descent.points):
+    if not descent.admitted:
         raise MeshError(
             "slim: the boundary of init meets itself, so that nothing keeps the map injective; "
             "start from tutte(mesh)"

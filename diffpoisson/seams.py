@@ -27,7 +27,7 @@ from diffpoisson import topology
 from diffpoisson.distortion import arap
 from diffpoisson.gradient import jacobians
 from diffpoisson.mesh import Mesh
-from diffpoisson.parameterization import tutte
+from diffpoisson.parameterization import harmonic_disk
 from diffpoisson.poisson import PoissonSolver
 from diffpoisson.repair import clamp_singular_values
 
@@ -106,7 +106,7 @@ def _opened(piece: _Piece) -> _Piece:
 
 def _extended(piece: _Piece, max_cuts: int) -> _Piece:
     """A disk whose seam was extended while that lowered the distortion of flattening it."""
-    pieces, energies, uv = [piece], [], tutte(piece.mesh)
+    pieces, energies, uv = [piece], [], harmonic_disk(piece.mesh)
     while True:
         mesh = pieces[-1].mesh
         uv = _local_global(mesh, uv)

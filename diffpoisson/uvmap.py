@@ -156,16 +156,16 @@ def parameterize(
         init: a map to start from, in the mesh's units, such as a network's: (n, 2) if the mesh is
             one disk, or a function that is called with the mesh of each chart and returns its map.
         cut: cut the surface where topology or low distortion ask for it, see `cut_to_disks`.
-        injective: where SLIM makes a chart overlap itself whatever the start, return the last map
-            before that, of higher distortion. If false, such a map is returned, not certified.
+        injective: keep charts from overlapping themselves, see `slim`. If false, SLIM's minimum is
+            returned, whose distortion is a little lower and which may not be certified.
         solver: a `PoissonSolver` of this mesh whose factor to use, where the mesh is the one chart.
         tolerance: of SLIM, see `slim`.
         max_iterations: of SLIM.
 
     Raises:
-        MeshError: components are not disks and `cut` is false; triangles that no map in the mesh's
-            dtype keeps from flipping.
-        ValueError: an initial map is not (n, 2) and finite, or the mesh is not one disk.
+        MeshError: not a surface in space; components that are not disks, unless `cut`; a component
+            too distorted for Tutte's embedding; or rounding to the mesh's dtype flips triangles.
+        ValueError: an initial map is not (n, 2) and finite, or is given for more than one disk.
     """
     _require_surface(mesh)
     overhead: dict[str, float] = {}
@@ -230,7 +230,7 @@ def _starts(
     return [_checked(mesh, init)[vertex_map]]
 
 
-def _checked(mesh: Mesh, init: object) -> Tensor:
+def _checked(mesh: Mesh, init: Tensor) -> Tensor:
     require_tensor("parameterize", "init", init, mesh.device)
     if init.shape != (mesh.n_vertices, 2):
         raise ValueError(
@@ -263,7 +263,7 @@ def _chart(part: _Part, flat: Flattening, uv: Float[Tensor, "n 2"]) -> Chart:
 # -------------------------------------------------------------------- what is refused
 
 
-def _require_surface(mesh: object) -> None:
+def _require_surface(mesh: Mesh) -> None:
     require_mesh("parameterize", mesh)
     if (mesh.cell_dim, mesh.dim) != (2, 3):
         kind = "tetrahedra" if mesh.cell_dim == 3 else f"vertices with D = {mesh.dim}"

@@ -28,10 +28,11 @@ from diffpoisson.spectral import (
     lumped_mass,
     wave_kernel_signature,
 )
-from diffpoisson.uvmap import UVMap, parameterize
+from diffpoisson.uvmap import Chart, UVMap, parameterize
 
 __all__ = [
     "Certificate",
+    "Chart",
     "CleanedMesh",
     "Mesh",
     "MeshError",

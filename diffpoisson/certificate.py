@@ -7,6 +7,7 @@ one-to-one: a point has as many preimages as the boundary winds around it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -33,6 +34,7 @@ class Certificate:
         simple_boundary: whether the boundary is one polygon that does not touch itself, decided
             exactly.
         min_determinant: smallest det J.
+        mean_distortion: area-weighted mean of max(σ₁, 1/σ₂), infinite at a flip.
         max_distortion: largest max(σ₁, 1/σ₂), infinite at a flip.
         energy: area-weighted mean symmetric Dirichlet energy, 4 at an isometry, infinite at a flip.
     """
@@ -40,6 +42,7 @@ class Certificate:
     n_flipped: int
     simple_boundary: bool
     min_determinant: float
+    mean_distortion: float
     max_distortion: float
     energy: float
 
@@ -56,18 +59,26 @@ def certify(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Certificate:
         mesh: a topological disk.
         uv: (n, 2) the map.
     """
-    J = jacobians(mesh, uv)
-    density = symmetric_dirichlet(J).double()
-    areas = mesh._double_measures
+    J = jacobians(mesh, uv.double())
+    distortion = isometric_distortion(J)
+    density = symmetric_dirichlet(J)
+    areas = mesh._double_measures / mesh._double_measures.sum()
     points = uv.detach().cpu().double().numpy()
     loops = [loop.cpu().numpy() for loop in mesh.boundary_loops]
     return Certificate(
-        n_flipped=int((orientations(points[mesh.faces.cpu().numpy()]) <= 0).sum()),
+        n_flipped=count_flips(mesh, uv),
         simple_boundary=len(loops) == 1 and is_simple(points[loops[0]]),
         min_determinant=float(determinant(J).min()),
-        max_distortion=float(isometric_distortion(J).max()),
-        energy=float((areas * density).sum() / areas.sum()),
+        mean_distortion=float((areas * distortion).sum()),
+        max_distortion=float(distortion.max()),
+        energy=float((areas * density).sum()),
     )
+
+
+def count_flips(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> int:
+    """Number of faces that a map does not orient positively, decided exactly."""
+    points = uv.detach().cpu().double().numpy()
+    return int((orientations(points[mesh.faces.cpu().numpy()]) <= 0).sum())
 
 
 def orientations(triangles: Float[np.ndarray, "m 3 2"]) -> np.ndarray:
@@ -88,23 +99,38 @@ def _exact_orientation(triangle: np.ndarray) -> int:
     return (area > 0) - (area < 0)
 
 
-def is_simple(polygon: Float[np.ndarray, "b 2"], chunk: int = 512) -> bool:
+def is_simple(polygon: Float[np.ndarray, "b 2"], at_once: int = 2**20) -> bool:
     """Whether a closed polygon's edges meet only at shared corners, decided exactly.
 
-    Compares the bounding boxes of all pairs of edges, a chunk of edges at a time, and then the
-    pairs whose boxes meet.
+    Looks at the pairs of edges whose bounding boxes meet, so many candidates at once.
     """
-    n = len(polygon)
     ends = np.roll(polygon, -1, axis=0)
-    low, high = np.minimum(polygon, ends), np.maximum(polygon, ends)
-    for start in range(0, n, chunk):
-        rows = np.arange(start, min(start + chunk, n))[:, None]
-        columns = np.arange(n)[None]
-        meet = (low[rows] <= high[columns]).all(-1) & (low[columns] <= high[rows]).all(-1)
-        i, j = np.nonzero(meet & (columns > rows))
-        if _any_improper_contact(polygon, i + start, j):
-            return False
-    return True
+    pairs = _meeting_boxes(np.minimum(polygon, ends), np.maximum(polygon, ends), at_once)
+    return not any(_any_improper_contact(polygon, i, j) for i, j in pairs)
+
+
+def boxes_apart(low: Float[np.ndarray, "k 2"], high: Float[np.ndarray, "k 2"]) -> bool:
+    """Whether no two of the boxes with these lower and upper corners have a common point."""
+    return all(len(i) == 0 for i, _ in _meeting_boxes(low, high))
+
+
+def _meeting_boxes(
+    low: np.ndarray, high: np.ndarray, at_once: int = 2**20
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pairs i < j of boxes that have a common point, some at a time.
+
+    In the order of their left sides, those that begin before box p ends follow p without a gap.
+    """
+    order = np.argsort(low[:, 0], kind="stable")
+    position = np.arange(len(low))
+    followers = np.searchsorted(low[order, 0], high[order, 0], side="right") - position - 1
+    total = np.cumsum(followers)
+    for start in range(0, int(total[-1]), at_once):
+        k = np.arange(start, min(start + at_once, total[-1]))  # of all pairs
+        p = np.searchsorted(total, k, side="right")
+        i, j = order[p], order[p + 1 + k - (total[p] - followers[p])]
+        meet = (low[i, 1] <= high[j, 1]) & (low[j, 1] <= high[i, 1])
+        yield np.minimum(i, j)[meet], np.maximum(i, j)[meet]
 
 
 def _any_improper_contact(polygon: np.ndarray, i: np.ndarray, j: np.ndarray) -> bool:

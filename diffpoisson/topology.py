@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse import csgraph
@@ -14,7 +16,9 @@ def half_edges(faces: np.ndarray) -> np.ndarray:
 
 def undirected_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(E, 2) sorted unique edges, and the number of faces at each."""
-    return np.unique(np.sort(half_edges(faces), axis=1), axis=0, return_counts=True)
+    edges = np.sort(half_edges(faces), axis=1)
+    _, first, counts = np.unique(_keys(edges), return_index=True, return_counts=True)
+    return edges[first], counts
 
 
 def component_labels(cells: np.ndarray, n_vertices: int) -> np.ndarray:
@@ -24,10 +28,33 @@ def component_labels(cells: np.ndarray, n_vertices: int) -> np.ndarray:
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
+class Part(NamedTuple):
+    """A connected component: indices of its cells and vertices, and the cells renumbered."""
+
+    cells: np.ndarray
+    vertices: np.ndarray
+    renumbered: np.ndarray
+
+
+def connected_parts(cells: np.ndarray, n_vertices: int) -> list[Part]:
+    """The connected components, in the order of their first vertices."""
+    of_vertex = component_labels(cells, n_vertices)
+    of_cell = of_vertex[cells[:, 0]]
+    sizes = np.bincount(of_vertex)
+    starts = np.cumsum(sizes) - sizes
+    order = np.argsort(of_vertex, kind="stable")
+    position = np.empty(n_vertices, dtype=np.int64)  # within the component
+    position[order] = np.arange(n_vertices) - np.repeat(starts, sizes)
+    by_part = np.argsort(of_cell, kind="stable")
+    cell_groups = np.split(by_part, np.cumsum(np.bincount(of_cell))[:-1])
+    vertex_groups = np.split(order, starts[1:])
+    return [Part(c, v, position[cells[c]]) for c, v in zip(cell_groups, vertex_groups, strict=True)]
+
+
 def is_manifold(faces: np.ndarray, n_vertices: int) -> bool:
     """Whether edges have at most two, consistently oriented faces and vertices one fan of faces."""
     directed = half_edges(faces)
-    if len(np.unique(directed, axis=0)) < len(directed):
+    if len(np.unique(_keys(directed))) < len(directed):
         return False
     return _count_fans(faces) == n_vertices
 
@@ -36,8 +63,12 @@ def boundary_half_edges(faces: np.ndarray) -> np.ndarray:
     """(b, 2) half-edges of the edges that have one face."""
     edges, counts = undirected_edges(faces)
     directed = half_edges(faces)
-    on_boundary = np.isin(_keys(np.sort(directed, axis=1)), _keys(edges[counts == 1]))
-    return directed[on_boundary]
+    return directed[are_among(directed, edges[counts == 1])]
+
+
+def are_among(edges: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(k,) whether each of the edges (k, 2), in whatever direction, is one of the others (l, 2)."""
+    return np.isin(_keys(np.sort(edges, axis=1)), _keys(np.sort(others, axis=1)))
 
 
 def cycles(tails: np.ndarray, heads: np.ndarray) -> list[np.ndarray]:

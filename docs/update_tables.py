@@ -97,7 +97,22 @@ def mutations() -> str:
     return "\n".join([head, *rows, f"| all | | {killed + survived} | {killed} | {survived} |"])
 
 
+def cli_trial() -> str:
+    """What `njf uv` made of meshes of many kinds, from `tests/benchmarks/cli_trial.py`."""
+    rows = json.loads((RESULTS / "cli_trial.json").read_text())["files"]
+    lines = ["| input | | charts | mean stretch | outcome |", "|---|---|---|---|---|"]
+    for row in rows:
+        if row["exit code"] == 0:
+            sure = "one-to-one, certified" if row["certified"] else "**overlaps**"
+            outcome = f"{row['charts']} | {row['mean_distortion']:.3f} | {sure}"
+        else:
+            outcome = f"– | – | `{row['stderr']}`"
+        lines.append(f"| `{row['file']}` | {row['kind']} | {outcome} |")
+    return "\n".join(lines)
+
+
 TABLES = {
+    "cli_trial": cli_trial,
     "uv_train": uv_train,
     "transforms": transforms,
     "poisson_cost": poisson_cost,

@@ -131,7 +131,7 @@ def make_module(options: argparse.Namespace, n_wks: int) -> NJFTraining:
         "output_dim": 2,
         "centering": "area" if options.loss == "paper" else "vertex",
     }
-    return NJFTraining(model, loss=options.loss)
+    return NJFTraining(model, {"supervised": options.loss})
 
 
 def fit(

@@ -67,7 +67,7 @@ def evaluate_uv(
         start = time.perf_counter()
         prediction = model(batch.shape, model.encode(batch.points))
         milliseconds = 1000 * (time.perf_counter() - start)
-        records.append(_record(examples.patches[index], batch, prediction, milliseconds))
+        records.append(_record(examples.patch(index), batch, prediction, milliseconds))
         maps.append(prediction.vertices[0])
     model.train(was_training)
     return records, maps

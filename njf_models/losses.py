@@ -1,4 +1,4 @@
-"""Supervised losses of a predicted map: distance of vertices and of Jacobians to a target map's."""
+"""Losses of a predicted map: distance to a target map, and distortion, which needs no target."""
 
 from __future__ import annotations
 
@@ -54,6 +54,24 @@ def official_loss(
     vertices = (prediction.vertices - centre_vertices(shape, target)).square().mean()
     jacobians = (prediction.jacobians - dp.jacobians(shape.mesh, target)).square().mean()
     return _sum(vertices, jacobians)
+
+
+def distortion_loss(
+    shape: Shape, prediction: Prediction, epsilon: float = 0.1
+) -> Float[Tensor, ""]:
+    """Mean over the area of log(E / 4), averaged over the shapes; 0 at isometries.
+
+    E is the symmetric Dirichlet energy of the emitted map, regularised so that flips are finite and
+    unflipping them lowers it. Its logarithm keeps a few deep flips from drowning everything else.
+
+    Args:
+        shape: the source(s).
+        prediction: maps to the plane.
+        epsilon: of `diffpoisson.symmetric_dirichlet`.
+    """
+    J = dp.jacobians(shape.mesh, prediction.vertices)
+    density = (dp.symmetric_dirichlet(J, epsilon) / 4).log()
+    return (shape.face_weights.to(density.dtype) * density).sum(-1).mean() / shape.mesh.n_parts
 
 
 def _sum(vertices: Tensor, jacobians: Tensor) -> Loss:

@@ -24,8 +24,8 @@ from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
-from njf_models.features import Shape, point_features
-from njf_models.losses import LOSSES, Loss
+from njf_models.features import Motions, Shape, point_features
+from njf_models.losses import LOSSES, Loss, distortion_loss
 from njf_models.metrics import count_flips
 from njf_models.njf import NeuralJacobianField, Prediction
 
@@ -68,6 +68,16 @@ class Batch:
             torch.cat([example.target for example in examples]),
         )
 
+    def moved(self, motions: Motions) -> Batch:
+        """Each part and its target as the network would see them turned and scaled.
+
+        The loss of the moved batch is that of an equally good map of the unmoved one: targets keep
+        their scale, since Jacobians have none.
+        """
+        images = motions.images.to(self.target.dtype)[self.shape.mesh.part_of_vertex]
+        target = (images @ self.target[..., None])[..., 0]
+        return Batch(self.shape.moved(motions), motions.points(self.points), target)
+
 
 class UVExamples(Dataset[Example]):
     """UV patches as training examples, each prepared at its first use and kept.
@@ -89,57 +99,109 @@ class UVExamples(Dataset[Example]):
     ) -> None:
         self.patches = patches
         self.n_points, self.resample, self.use_wks = n_points, resample, use_wks
-        self._shapes: dict[int, Shape] = {}
+        self._kept: dict[int, tuple[UVPatch, Shape]] = {}
 
     def __len__(self) -> int:
         return len(self.patches)
 
+    def patch(self, index: int) -> UVPatch:
+        """The patch of an example."""
+        return self._prepared(index)[0]
+
     def __getitem__(self, index: int) -> Example:
-        patch = self.patches[index]
-        wks = patch.wks if self.use_wks else None
-        if index not in self._shapes:
-            self._shapes[index] = Shape.prepare(patch.mesh, wks)
+        patch, shape = self._prepared(index)
         generator = None if self.resample else torch.Generator().manual_seed(index)
         samples = dp.sample_surface(patch.mesh, self.n_points, generator=generator)
-        points = point_features(patch.mesh, samples, wks).float()
-        return Example(self._shapes[index], points, patch.uv.float())
+        points = point_features(patch.mesh, samples, patch.wks if self.use_wks else None)
+        return Example(shape, points.float(), patch.uv.float())
+
+    def _prepared(self, index: int) -> tuple[UVPatch, Shape]:
+        if index not in self._kept:
+            patch = self.patches[index]
+            shape = Shape.prepare(patch.mesh, patch.wks if self.use_wks else None)
+            self._kept[index] = patch, shape
+        return self._kept[index]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What training minimises: supervised loss + distortion · distortion loss.
+
+    Attributes:
+        supervised: "paper" or "official" (see `losses`), or None for training without targets.
+        distortion: weight of `losses.distortion_loss`, for maps to the plane.
+        epsilon: its regularisation.
+        augment: whether each batch is turned, mirrored and scaled at random.
+    """
+
+    supervised: str | None = "paper"
+    distortion: float = 0.0
+    epsilon: float = 0.1
+    augment: bool = False
+
+    def __post_init__(self) -> None:
+        if self.supervised is not None and self.supervised not in LOSSES:
+            raise ValueError(
+                f"Objective: supervised must be None or one of {sorted(LOSSES)}, "
+                f"got {self.supervised!r}"
+            )
+        if self.supervised is None and not self.distortion > 0:
+            raise ValueError("Objective: without targets, distortion must have a positive weight")
+
+    def __call__(self, batch: Batch, prediction: Prediction) -> Loss:
+        """Loss of one round, and its terms."""
+        zero = prediction.vertices.new_zeros(())
+        loss = Loss(zero, zero, zero)
+        if self.supervised is not None:
+            loss = LOSSES[self.supervised](batch.shape, prediction, batch.target)
+        if self.distortion:
+            distortion = distortion_loss(batch.shape, prediction, self.epsilon)
+            loss = loss._replace(total=loss.total + self.distortion * distortion)
+        return loss
 
 
 class NJFTraining(lightning.LightningModule):
-    """Supervised training: Adam, 1e-3 falling to 1e-4 when the validation loss stops improving.
+    """Training with Adam, by the paper's schedule or by a cosine.
 
     Args:
         model: arguments of `NeuralJacobianField`, kept in the checkpoint.
-        loss: a key of `losses.LOSSES`, "paper" or "official".
+        objective: arguments of `Objective`.
         learning_rate: of Adam, at the start.
-        patience: validations without improvement before the rate falls to a tenth.
+        patience: validations without improvement before the rate falls to a tenth (the paper).
+        steps: let the rate fall to zero along a cosine over so many steps instead.
+        inputs: the options of `UVExamples` that decide what the network sees, for the record.
     """
 
     def __init__(
         self,
         model: dict[str, Any],
+        objective: dict[str, Any] | None = None,
         *,
-        loss: str = "paper",
         learning_rate: float = 1e-3,
         patience: int = 10,
+        steps: int | None = None,
+        inputs: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if loss not in LOSSES:
-            raise ValueError(f"NJFTraining: loss must be one of {sorted(LOSSES)}, got {loss!r}")
+        self.objective = Objective(**(objective or {}))
         self.save_hyperparameters()
         self.model = NeuralJacobianField(**model)
-        self.loss, self.learning_rate, self.patience = LOSSES[loss], learning_rate, patience
+        self.learning_rate, self.patience, self.steps = learning_rate, patience, steps
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Loss of one packed batch."""
-        loss = self._predict(batch)[1].total
+        """Loss of one packed batch, averaged over the rounds."""
         size = len(batch.points)
+        if self.objective.augment:
+            batch = batch.moved(Motions.random(size))
+        losses = [self.objective(batch, prediction).total for prediction in self._iterates(batch)]
+        loss = torch.stack(losses).mean()
         self.log("train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        """Losses and flips per shape of one packed batch."""
-        prediction, loss = self._predict(batch)
+        """Losses and flips per shape of one packed batch, after the last round."""
+        prediction = self._iterates(batch)[-1]
+        loss = self.objective(batch, prediction)
         size = len(batch.points)
         values = {f"validation/{name}": value for name, value in loss._asdict().items()}
         if self.model.output_dim == 2:
@@ -148,24 +210,27 @@ class NJFTraining(lightning.LightningModule):
         self.log("validation/loss", loss.total, prog_bar=True, batch_size=size)
         self.log_dict(values, batch_size=size)
 
+    def _iterates(self, batch: Batch) -> list[Prediction]:
+        return self.model.iterates(batch.shape, self.model.encode(batch.points))
+
+    def configure_optimizers(self) -> Any:
+        """Adam and the schedule of its rate."""
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.learning_rate)
+        if self.steps is not None:
+            cosine = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
+            scheduler = {"scheduler": cosine, "interval": "step"}
+        else:
+            plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
+                optimizer, factor=0.1, patience=self.patience, min_lr=self.learning_rate / 10
+            )
+            scheduler = {"scheduler": plateau, "monitor": "validation/loss"}
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
     def transfer_batch_to_device(
         self, batch: Batch, device: torch.device, dataloader_idx: int
     ) -> Batch:
         """The batch as it is: it lives where its factors do."""
         return batch
-
-    def _predict(self, batch: Batch) -> tuple[Prediction, Loss]:
-        prediction = self.model(batch.shape, self.model.encode(batch.points))
-        return prediction, self.loss(batch.shape, prediction, batch.target)
-
-    def configure_optimizers(self) -> Any:
-        """Adam with the paper's schedule."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.learning_rate)
-        schedule = torch.optim.lr_scheduler.ReduceLROnPlateau(
-            optimizer, factor=0.1, patience=self.patience, min_lr=self.learning_rate / 10
-        )
-        scheduler = {"scheduler": schedule, "monitor": "validation/loss"}
-        return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
 
 def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Example]:
@@ -174,7 +239,13 @@ def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> D
 
 
 def make_trainer(
-    folder: Path, *, minutes: float | None = None, stop_after: int | None = None
+    folder: Path,
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    stop_after: int | None = None,
+    validate_every: int | None = None,
+    processes: int = 1,
 ) -> lightning.Trainer:
     """A trainer that shows progress, logs to CSV and TensorBoard, and can be stopped and resumed.
 
@@ -184,7 +255,10 @@ def make_trainer(
     Args:
         folder: where logs and checkpoints go.
         minutes: stop after this time; None for no limit.
+        steps: stop after so many steps; None for no limit.
         stop_after: stop after this many validations without improvement; None for no such limit.
+        validate_every: validate after so many steps, not after each pass over the data.
+        processes: train data-parallel in so many processes on this machine.
     """
     checkpoints = ModelCheckpoint(
         dirpath=folder / "checkpoints",
@@ -200,7 +274,12 @@ def make_trainer(
         callbacks.append(EarlyStopping("validation/loss", patience=stop_after))
     return lightning.Trainer(
         accelerator="cpu",
+        strategy="ddp" if processes > 1 else "auto",
+        devices=processes,
         max_epochs=-1,
+        max_steps=-1 if steps is None else steps,
+        val_check_interval=validate_every,
+        check_val_every_n_epoch=1 if validate_every is None else None,
         max_time=None if minutes is None else timedelta(minutes=minutes),
         callbacks=callbacks,
         logger=[CSVLogger(folder, name="csv"), TensorBoardLogger(folder, name="tensorboard")],

@@ -77,7 +77,7 @@ def test_simplicity_against_brute_force(seed, n, grid):
     rng = np.random.default_rng(seed)
     polygon = rng.integers(0, 5, (n, 2)).astype(float) if grid else rng.standard_normal((n, 2))
     assert is_simple(polygon) == brute_force_simple(polygon)
-    assert is_simple(polygon, chunk=2) == is_simple(polygon)
+    assert is_simple(polygon, at_once=2) == is_simple(polygon)
 
 
 def test_regular_polygons_are_simple_and_stars_are_not():

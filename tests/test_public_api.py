@@ -13,6 +13,7 @@ import diffpoisson as dp
 
 NAMES = [
     "Certificate",
+    "Chart",
     "CleanedMesh",
     "Mesh",
     "MeshError",

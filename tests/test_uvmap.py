@@ -1,10 +1,14 @@
-"""A valid map comes out whatever goes in."""
+"""A valid map comes out whatever goes in: any topology, any start, any unit."""
 
 from __future__ import annotations
+
+from fractions import Fraction
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import diffpoisson as dp
 from tests import meshes, references
@@ -12,10 +16,51 @@ from tests.checks import assert_near
 from tests.test_repair import spoiled
 
 
-def independent_flips(mesh: dp.Mesh, uv: torch.Tensor) -> int:
-    corners = uv.double().numpy()[mesh.faces.numpy()]
-    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return int((e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0] <= 0).sum())
+def exact_flips(triangles: np.ndarray) -> int:
+    """Triangles of no positive area, in rational arithmetic."""
+    count = 0
+    for triangle in triangles:
+        (ax, ay), (bx, by), (cx, cy) = [[Fraction(float(x)) for x in p] for p in triangle]
+        count += (bx - ax) * (cy - ay) <= (by - ay) * (cx - ax)
+    return count
+
+
+def covered(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """By how many open triangles each point is covered."""
+    corners, p = triangles[None], points[:, None]
+    inside = np.ones((len(points), len(triangles)), dtype=bool)
+    for k in range(3):
+        edge, arm = corners[:, :, k - 2] - corners[:, :, k], p - corners[:, :, k]
+        inside &= edge[..., 0] * arm[..., 1] > edge[..., 1] * arm[..., 0]
+    return inside.sum(axis=1)
+
+
+def assert_valid(mesh: dp.Mesh, uvmap: dp.UVMap) -> None:
+    """The surface is the mesh's, cut; the map neither flips nor overlaps; charts are apart."""
+    surface = uvmap.mesh
+    assert torch.equal(uvmap.vertex_map[surface.faces], mesh.faces)
+    assert torch.equal(surface.vertices, mesh.vertices[uvmap.vertex_map])
+    assert uvmap.uv.dtype == mesh.dtype
+    triangles = uvmap.uv.double().numpy()[surface.faces.numpy()]
+    assert uvmap.flipped == exact_flips(triangles) == 0
+    assert uvmap.certified
+    rng = np.random.default_rng(0)
+    inside = rng.dirichlet(np.ones(3), (len(triangles), 3))
+    points = np.einsum("mkc,mcx->mkx", inside, triangles).reshape(-1, 2)
+    assert covered(triangles, points).max() == 1
+    assert sorted(torch.cat([chart.faces for chart in uvmap.charts]).tolist()) == list(
+        range(mesh.n_faces)
+    )
+    boxes = [
+        (t.min(axis=(0, 1)), t.max(axis=(0, 1)))
+        for t in (triangles[c.faces.numpy()] for c in uvmap.charts)
+    ]
+    for i, (low, high) in enumerate(boxes):
+        assert all((high < other[0]).any() or (other[1] < low).any() for other in boxes[:i])
+        assert (uvmap.chart_of_face[uvmap.charts[i].faces] == i).all()
+
+
+# -------------------------------------------------------------------- one disk
 
 
 @pytest.mark.parametrize("kind", ["none", "valid", "some flips", "noise", "mirrored", "collapsed"])
@@ -30,8 +75,8 @@ def test_every_start_ends_valid_and_as_good_as_slim(kind):
         "collapsed": torch.zeros(mesh.n_vertices, 2, dtype=torch.float64),
     }
     result = dp.parameterize(mesh, starts[kind], solver=solver)
-    assert result.flipped == independent_flips(mesh, result.uv) == 0
-    assert result.certified
+    assert_valid(mesh, result)
+    assert result.mesh is mesh
     best = dp.slim(mesh, dp.tutte(mesh)).energies[-1]
     assert result.energy <= 1.001 * best
     V, F = mesh.vertices.numpy(), mesh.faces.numpy()
@@ -49,12 +94,148 @@ def test_result_does_not_depend_on_unit():
     assert_near(b.uv / 1e5, a.uv, 1e-3)
 
 
+def winding_strip(turns: float, size: int = 24) -> dp.Mesh:
+    """A ring's strip that climbs as it winds: flat, it would cover itself."""
+    angle, radius = np.meshgrid(
+        np.linspace(0, 2 * np.pi * turns, size), [0.3, 0.65, 1.0], indexing="ij"
+    )
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 * angle], axis=-1)
+    grid = np.arange(3 * size).reshape(size, 3)
+    a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    return dp.Mesh(vertices.reshape(-1, 3), np.r_[np.c_[a, b, c], np.c_[a, c, d]])
+
+
+def test_overlaps_are_kept_off_at_a_price():
+    mesh = winding_strip(1.2)
+    free = dp.parameterize(mesh, injective=False)
+    assert free.flipped == 0
+    assert not free.certified
+    triangles = free.uv.numpy()[mesh.faces.numpy()]
+    assert covered(triangles, triangles.mean(axis=1)).max() > 1
+    apart = dp.parameterize(mesh)
+    assert_valid(mesh, apart)
+    assert apart.method == "tutte+scaffold"
+    assert free.energy < apart.energy < 1.01 * free.energy
+    # Also from a map that overlaps already: nothing but Tutte's embedding helps then.
+    assert_valid(mesh, dp.parameterize(mesh, free.uv))
+
+
+def test_a_strip_that_does_not_cover_itself_needs_no_scaffold():
+    result = dp.parameterize(winding_strip(0.9))
+    assert_valid(result.mesh, result)
+    assert result.method == "tutte"
+
+
+# -------------------------------------------------------------------- any surface
+
+
+@settings(max_examples=15)
+@given(arrays=meshes.meshes(meshes.SPATIAL), single=st.booleans())
+def test_every_topology_cut(arrays, single):
+    vertices, faces = arrays
+    mesh = dp.Mesh(vertices.astype(np.float32) if single else vertices, faces)
+    assert_valid(mesh, dp.parameterize(mesh, cut=True))
+
+
+def test_components_are_mapped_each_on_its_own():
+    parts = [meshes.disk(0, 6), meshes.triangle(1), meshes.disk(2, 4)]
+    mesh = dp.Mesh(*meshes.union(*parts))
+    uvmap = dp.parameterize(mesh)
+    assert_valid(mesh, uvmap)
+    assert uvmap.mesh is mesh
+    alone = [dp.parameterize(dp.Mesh(*part)) for part in parts]
+    assert [len(chart.faces) for chart in uvmap.charts] == [50, 1, 18]
+    for chart, single in zip(uvmap.charts, alone, strict=True):
+        assert chart.certificate.energy == pytest.approx(single.energy)
+    areas = mesh.areas.numpy()
+    for name in ("energy", "mean_distortion"):
+        values = [getattr(single, name) for single in alone]
+        weights = [areas[chart.faces].sum() for chart in uvmap.charts]
+        assert getattr(uvmap, name) == pytest.approx(np.average(values, weights=weights))
+    assert uvmap.max_distortion == pytest.approx(max(a.max_distortion for a in alone))
+    assert uvmap.min_determinant == pytest.approx(min(a.min_determinant for a in alone))
+    assert uvmap.slim_iterations == sum(a.slim_iterations for a in alone)
+    assert uvmap.method == "tutte"
+    assert uvmap.milliseconds["slim"] == pytest.approx(
+        sum(chart.milliseconds["slim"] for chart in uvmap.charts)
+    )
+    assert "pack" in uvmap.milliseconds
+
+
+def test_one_overlapping_pair_of_charts_is_not_certified():
+    mesh = dp.Mesh(*meshes.union(meshes.disk(0), meshes.disk(1)))
+    uvmap = dp.parameterize(mesh)
+    moved = uvmap.uv - uvmap.uv.amin(0)
+    moved[25:] -= moved[25:].amin(0)
+    same_charts = dp.UVMap(mesh, moved, uvmap.vertex_map, uvmap.charts)
+    assert all(chart.certificate.injective for chart in same_charts.charts)
+    assert not same_charts.certified
+
+
+def test_a_function_maps_each_chart():
+    mesh = dp.Mesh(*meshes.union(meshes.disk(0), meshes.disk(1, 4)))
+    seen = []
+
+    def project(chart: dp.Mesh) -> torch.Tensor:
+        seen.append(chart.n_vertices)
+        return chart.vertices[:, :2]
+
+    uvmap = dp.parameterize(mesh, project)
+    assert_valid(mesh, uvmap)
+    assert seen == [25, 16]
+    assert uvmap.method == "init"
+
+
+def test_a_map_of_one_disk_follows_its_cuts():
+    """A tall cap that gets seams: their copies start where the vertex was."""
+    flat, faces = meshes.planar_disk(0, 15)
+    x, y = (2 * flat - 1).T
+    mesh = dp.Mesh(np.c_[x, y, 4 * (1 - x**4) * (1 - y**4)], faces)
+    uvmap = dp.parameterize(mesh, mesh.vertices[:, :2], cut=True)
+    assert_valid(mesh, uvmap)
+    assert uvmap.mesh.n_vertices > mesh.n_vertices
+    assert uvmap.method.startswith("init")
+
+
+# -------------------------------------------------------------------- what raises
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("sphere", "component 0 of 1 has Euler characteristic 2, 0 boundary loops and genus 0"),
+        ("torus", "Euler characteristic 0, 0 boundary loops and genus 1"),
+        ("annulus", "Euler characteristic 0, 2 boundary loops and genus 0"),
+        ("parts", "component 1 of 3 has Euler characteristic 2"),
+        ("book", "component 0 of 1 has 1 edges with more than two faces"),
+        ("bowtie", "pinched vertices"),
+        ("moebius", "inconsistent orientation"),
+    ],
+)
+def test_what_is_not_a_disk_is_named_with_the_remedy(name, message):
+    with pytest.raises(dp.MeshError, match=rf"{message}.*cut=True"):
+        dp.parameterize(dp.Mesh(*meshes.SPATIAL[name](0)))
+
+
 def test_what_cannot_be_mapped_raises():
-    sphere = dp.Mesh(*meshes.sphere())
-    with pytest.raises(dp.MeshError, match="topological disk"):
-        dp.parameterize(sphere)
+    for build, words in ((meshes.planar_disk, "D = 2"), (meshes.box, "tetrahedra")):
+        with pytest.raises(dp.MeshError, match=words):
+            dp.parameterize(dp.Mesh(*build()))
     mesh = dp.Mesh(*meshes.disk())
     with pytest.raises(ValueError, match=r"expected init of shape \(n=25, 2\), got \(4, 2\)"):
         dp.parameterize(mesh, torch.zeros(4, 2))
     with pytest.raises(ValueError, match="not finite"):
         dp.parameterize(mesh, torch.full((25, 2), np.nan))
+    several = dp.Mesh(*meshes.parts())
+    with pytest.raises(ValueError, match="one disk"):
+        dp.parameterize(several, several.vertices[:, :2], cut=True)
+
+
+def test_what_rounding_flips_raises():
+    """Beside a chart a hundred million times as large, float32 cannot tell corners apart."""
+    small, large = meshes.disk(0), meshes.disk(1)
+    vertices, faces = meshes.union((1e-4 * small[0], small[1]), (1e4 * large[0], large[1]))
+    mesh = dp.Mesh(vertices.astype(np.float32), faces)
+    with pytest.raises(dp.MeshError, match=r"rounding the map to torch.float32 .*float64"):
+        dp.parameterize(mesh)
+    assert_valid(mesh.to(torch.float64), dp.parameterize(mesh.to(torch.float64)))

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from diffpoisson.mesh import Mesh
+from njf_models.meshfiles import read_mesh_file
 
 _MESH_SUFFIXES = {".obj", ".off", ".ply", ".stl"}
 
@@ -231,10 +232,8 @@ def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: the file holds no usable triangle.
     """
-    import trimesh  # noqa: PLC0415  (only needed where files are read)
-
-    mesh = trimesh.load_mesh(path, process=False)
-    return _cleaned(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    mesh = read_mesh_file(path).cleaned().mesh
+    return mesh.vertices.numpy(), mesh.faces.numpy()
 
 
 def _refined(

@@ -75,8 +75,8 @@ def test_no_checkpoint_yet(tmp_path):
 
 
 def test_unknown_loss_raises():
-    with pytest.raises(ValueError, match="loss must be one of"):
-        NJFTraining(MODEL, loss="best")
+    with pytest.raises(ValueError, match="supervised must be None or one of"):
+        NJFTraining(MODEL, {"supervised": "best"})
 
 
 def test_a_packed_step_has_the_gradient_of_the_mean_over_its_shapes(patches):

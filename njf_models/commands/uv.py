@@ -1,0 +1,445 @@
+"""`njf uv`: UV maps for mesh files, one or a folder of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from njf_models.commands import CommandError, UsageError
+
+_DESCRIPTION = """\
+Give a mesh UVs: cut into charts where it is no disk, flattened with little distortion, no triangle
+flipped, and checked in exact arithmetic. Geometry is not touched: vertices, polygons, normals and
+groups of an OBJ stay as they are, only its UVs are replaced. Pictures on the surface are baked into
+one for the new UVs.
+"""
+
+_EPILOG = """\
+examples:
+  njf uv bunny.obj bunny_uv.obj
+  njf uv scan.ply scan.glb --checkerboard --report scan.html
+  njf uv scans/ unwrapped/ --recursive --format glb --jobs 4 --json results.json
+  njf uv part.stl --json -              only the figures
+
+UVs lie in the unit square, both axes by the same scale.
+exit codes: 0 every file was mapped, 1 some were not, 2 wrong usage, 130 interrupted
+"""
+
+
+def add_parser(subparsers: Any) -> argparse.ArgumentParser:
+    """Register the command."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        "uv",
+        help="give meshes UVs",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("input", type=Path, help="obj, ply, off, stl or glb file, or a folder of them")
+    add("output", type=Path, nargs="?", help="obj or glb file; a folder, if the input is one")
+    add(
+        "--report",
+        type=Path,
+        metavar="PAGE.html",
+        help="write a page to look at the map, beside SLIM and LSCM; a folder of them for a folder",
+    )
+    add("--json", metavar="FILE", help="write figures and failures as JSON; - for stdout")
+    add(
+        "--start",
+        choices=("network", "tutte"),
+        default="network",
+        help="what makes the first map of a chart (default: network)",
+    )
+    add("--no-cut", action="store_true", help="fail where the mesh is no disk, instead of cutting")
+    add(
+        "--tolerance",
+        type=_positive,
+        default=1e-6,
+        metavar="T",
+        help="SLIM stops when an iteration gains less than this fraction (default: 1e-6)",
+    )
+    add(
+        "--checkerboard",
+        action="store_true",
+        help="texture the output with a checkerboard, unless it has pictures of its own",
+    )
+    folders = parser.add_argument_group("folders")
+    folders.add_argument(
+        "--format",
+        choices=("obj", "glb"),
+        default="obj",
+        help="of the files written (default: obj)",
+    )
+    folders.add_argument("--recursive", action="store_true", help="look into subfolders too")
+    folders.add_argument(
+        "--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)"
+    )
+    return parser
+
+
+def run(options: argparse.Namespace) -> int:
+    """Map one file or a folder; 1 if any file failed."""
+    _check_usage(options)
+    single = not options.input.is_dir()
+    records = [convert(_single(options))] if single else _batch(_folder(options), options)
+    return _finish(records, options, single)
+
+
+# -------------------------------------------------------------------- what to do
+
+
+@dataclass(frozen=True)
+class Task:
+    """One file to map."""
+
+    input: Path
+    output: Path | None
+    report: Path | None
+    start: str
+    cut: bool
+    tolerance: float
+    checkerboard: bool
+    threads: int
+    debug: bool
+
+
+def _check_usage(options: argparse.Namespace) -> None:
+    source, target = options.input, options.output
+    if source.is_dir():
+        if target is not None and target.is_file():
+            raise UsageError(f"{target} is a file, but the input is a folder: name a folder")
+        if target is not None and target.resolve() == source.resolve():
+            raise UsageError("input and output are the same folder: name another one")
+        return
+    for path in (target, options.report):
+        if path is not None and path.is_dir():
+            raise UsageError(f"{path} is a folder, but the input is a file: name a file")
+    if target is None:
+        return
+    from njf_models.meshfiles import WRITABLE  # noqa: PLC0415  (imports torch)
+
+    if target.suffix.lower() not in WRITABLE:
+        raise UsageError(f"{target}: only {' and '.join(WRITABLE)} files are written")
+    if target.resolve() == source.resolve():
+        raise UsageError("input and output are the same file: name another one")
+
+
+def _task(
+    options: argparse.Namespace, source: Path, output: Path | None, page: Path | None
+) -> Task:
+    threads = max(1, (os.cpu_count() or 1) // options.jobs)
+    return Task(
+        source,
+        output,
+        page,
+        options.start,
+        not options.no_cut,
+        options.tolerance,
+        options.checkerboard,
+        threads,
+        options.debug,
+    )
+
+
+def _single(options: argparse.Namespace) -> Task:
+    return _task(options, options.input, options.output, options.report)
+
+
+def _folder(options: argparse.Namespace) -> list[Task]:
+    """A task for each mesh file, outputs in the same subfolders."""
+    from njf_models.meshfiles import READABLE  # noqa: PLC0415  (imports torch)
+
+    root = options.input
+    found = sorted(root.rglob("*") if options.recursive else root.glob("*"))
+    own = [folder.resolve() for folder in (options.output, options.report) if folder is not None]
+    tasks = []
+    for path in found:
+        mine = any(path.resolve().is_relative_to(folder) for folder in own)
+        if path.suffix.lower() in READABLE and path.is_file() and not mine:
+            name = path.relative_to(root)
+            output = options.output and options.output / name.with_suffix(f".{options.format}")
+            page = options.report and options.report / name.with_suffix(".html")
+            tasks.append(_task(options, path, output, page))
+    if not tasks:
+        hint = "" if options.recursive else "; --recursive looks into subfolders"
+        raise CommandError(f"no {', '.join(READABLE)} file in {root}{hint}")
+    return tasks
+
+
+# -------------------------------------------------------------------- one file
+
+
+def convert(task: Task) -> dict[str, Any]:
+    """Map one file and write what was asked for; failures become records, too."""
+    from diffpoisson import MeshError  # noqa: PLC0415  (imports torch)
+    from njf_models.meshfiles import MeshFileError  # noqa: PLC0415
+
+    start = time.perf_counter()
+    record: dict[str, Any] = {"input": str(task.input), "status": "failed"}
+    try:
+        record |= _convert(task) | {"status": "ok"}
+    except (MeshFileError, MeshError, CommandError) as error:
+        record["error"] = str(error)
+    except Exception as error:  # one bad file must not end a batch
+        if task.debug:
+            raise
+        record["error"] = f"{' '.join(str(error).split())} ({type(error).__name__})"
+    return record | {"seconds": round(time.perf_counter() - start, 3)}
+
+
+def _convert(task: Task) -> dict[str, Any]:
+    import torch  # noqa: PLC0415  (imports are slow, and --help must not be)
+
+    from njf_models import meshfiles  # noqa: PLC0415
+
+    torch.set_num_threads(task.threads)
+    file = meshfiles.read_mesh_file(task.input)
+    cleaned = file.cleaned()
+    uvmap = _parameterize(cleaned.mesh, task)
+    layout = meshfiles.unit_square_layout(file, cleaned, uvmap)
+    record = _figures(file, cleaned, uvmap)
+    if task.output is not None:
+        written = meshfiles.write_mesh_file(
+            task.output, file, layout, checkerboard=task.checkerboard
+        )
+        record |= {"output": str(task.output), "files": [path.name for path in written]}
+        record["notes"] += _notes_on_output(file, layout, task.output.suffix.lower())
+    if task.report is not None:
+        record["report"] = str(task.report)
+        _write_report(task, cleaned.mesh, uvmap)
+    return record
+
+
+def _parameterize(mesh: Any, task: Task) -> Any:
+    import diffpoisson as dp  # noqa: PLC0415
+
+    if task.start == "tutte":
+        return dp.parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
+    try:
+        from njf_models import parameterize  # noqa: PLC0415
+    except ModuleNotFoundError:
+        raise
+    except ImportError as error:
+        raise CommandError("this version has no trained network: use --start tutte") from error
+    return parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
+
+
+def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:
+    dropped = len(file.faces) - cleaned.mesh.n_faces
+    notes = [f"{dropped:,} triangles without area have no UVs of their own"] if dropped else []
+    return {
+        "vertices": len(file.vertices),
+        "triangles": len(file.faces),
+        "charts": len(uvmap.charts),
+        "flipped": uvmap.flipped,
+        "certified": uvmap.certified,
+        "energy": uvmap.energy,
+        "mean_distortion": uvmap.mean_distortion,
+        "max_distortion": uvmap.max_distortion,
+        "method": uvmap.method,
+        "slim_iterations": uvmap.slim_iterations,
+        "milliseconds": {stage: round(t, 3) for stage, t in uvmap.milliseconds.items()},
+        "notes": notes,
+    }
+
+
+def _notes_on_output(file: Any, layout: Any, suffix: str) -> list[str]:
+    """What is not as it was, apart from the UVs."""
+    from njf_models.meshfiles import count_crossed_polygons  # noqa: PLC0415
+
+    notes = []
+    if file.paint is not None:
+        notes.append("pictures were baked into one for the new UVs")
+    if suffix == ".obj" and (crossed := count_crossed_polygons(file, layout)):
+        notes.append(f"{crossed:,} polygons that seams cross were written as triangles")
+    return notes
+
+
+def _write_report(task: Task, mesh: Any, uvmap: Any) -> None:
+    from njf_models.comparison import compare  # noqa: PLC0415
+    from njf_models.meshfiles import whole_file  # noqa: PLC0415
+    from njf_models.page import uv_page  # noqa: PLC0415
+
+    assert task.report is not None
+    title = "njf" if task.start == "network" else "njf from Tutte"
+    maps = compare(uvmap, title, tolerance=task.tolerance)
+    y_up = task.input.suffix.lower() in (".obj", ".glb")  # as these formats have it by custom
+    text = uv_page(task.input.name, mesh, uvmap, maps, y_up=y_up)
+    with whole_file(task.report) as path:
+        path.write_text(text, encoding="utf-8")
+
+
+# -------------------------------------------------------------------- many files
+
+
+def _batch(tasks: list[Task], options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Records of all tasks, in their order; a process each, so that even a crash is one file's."""
+    from tqdm import tqdm  # noqa: PLC0415
+
+    records: list[dict[str, Any] | None] = [None] * len(tasks)
+    taken: dict[Path | None, Path] = {}
+    todo = []
+    for i, task in enumerate(tasks):
+        if task.output is not None and task.output in taken:
+            error = f"{task.output} is what {taken[task.output].name} becomes: rename one of them"
+            records[i] = {"input": str(task.input), "status": "failed", "error": error}
+        else:
+            taken[task.output] = task.input
+            todo.append(i)
+    with _Workers(options.jobs) as workers:
+        futures = {workers.submit(tasks[i]): i for i in todo}
+        progress = tqdm(as_completed(futures), total=len(todo), unit="file", disable=None)
+        for future in progress:
+            records[futures[future]] = future.result()
+    return [record for record in records if record is not None]
+
+
+class _Workers:
+    """Runs each task in a process of its own, some at a time; leaving early ends them."""
+
+    def __init__(self, jobs: int) -> None:
+        self.context = multiprocessing.get_context("forkserver")
+        self.context.set_forkserver_preload(["njf_models.meshfiles", "njf_models.commands.uv"])
+        self.threads = ThreadPoolExecutor(jobs)
+        self.starting = threading.Lock()  # a process can only be ended once it has started
+        self.running: set[Any] = set()
+        self.stopped = False
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            with self.starting:
+                self.stopped = True
+                for process in self.running:
+                    process.terminate()
+        self.threads.shutdown(cancel_futures=True)
+
+    def submit(self, task: Task) -> Future[dict[str, Any]]:
+        """Run a task as soon as a process is free."""
+        return self.threads.submit(self._isolated, task)
+
+    def _isolated(self, task: Task) -> dict[str, Any]:
+        receiver, sender = self.context.Pipe(duplex=False)
+        process = self.context.Process(target=_child, args=(task, sender))
+        with self.starting:
+            if self.stopped:
+                raise CancelledError
+            process.start()
+            self.running.add(process)
+        sender.close()
+        try:
+            record: dict[str, Any] = receiver.recv()
+        except EOFError:
+            process.join()
+            error = f"the process ended without a result (exit code {process.exitcode})"
+            record = {"input": str(task.input), "status": "failed", "error": error}
+        process.join()
+        with self.starting:
+            self.running.discard(process)
+        return record
+
+
+def _child(task: Task, sender: Connection) -> None:
+    """In a process of its own: map one file. Both signals unwind, so that no half file stays."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        sender.send(convert(task))
+    except KeyboardInterrupt:
+        os._exit(130)
+
+
+# -------------------------------------------------------------------- what came of it
+
+
+def _finish(records: list[dict[str, Any]], options: argparse.Namespace, single: bool) -> int:
+    failures = [record for record in records if record["status"] != "ok"]
+    lines = list(_summary(records, None if single else options.input))
+    to_stdout = options.json == "-"
+    if lines:
+        print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
+    for record in failures:
+        print(f"njf uv: {record['input']}: {record['error']}", file=sys.stderr)
+    if options.json:
+        _write_json(records, len(failures), options.json)
+    return 1 if failures else 0
+
+
+def _summary(records: list[dict[str, Any]], folder: Path | None) -> Iterator[str]:
+    """A line per file, and of a batch one more with the counts."""
+    paths = [Path(record["input"]) for record in records]
+    names = [str(path.relative_to(folder)) if folder else path.name for path in paths]
+    width = max(map(len, names))
+    for name, record in zip(names, records, strict=True):
+        if record["status"] == "ok":
+            yield f"{name:<{width}}  {_line(record)}"
+            yield from (f"{'':<{width}}  {note}" for note in record["notes"])
+        elif folder:
+            yield f"{name:<{width}}  FAILED"
+    if folder:
+        failed = sum(record["status"] != "ok" for record in records)
+        yield f"{len(records)} files: {len(records) - failed} mapped, {failed} failed"
+
+
+def _line(record: dict[str, Any]) -> str:
+    charts = f"{record['charts']} chart{'s' if record['charts'] > 1 else ''}"
+    sure = "certified" if record["certified"] else "NOT one-to-one"
+    return (
+        f"{record['triangles']:>9,} triangles  {charts:>10}  distortion "
+        f"{record['mean_distortion']:.3f} mean, {record['max_distortion']:.2f} max  "
+        f"{record['flipped']} flipped  {sure}  {record['seconds']:.1f} s"
+    )
+
+
+def _write_json(records: list[dict[str, Any]], failed: int, where: str) -> None:
+    result = {"files": [_finite(record) for record in records], "failed": failed}
+    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
+    if where == "-":
+        sys.stdout.write(text)
+        return
+    from njf_models.meshfiles import whole_file  # noqa: PLC0415
+
+    try:
+        with whole_file(Path(where)) as path:
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"{where}: {error.strerror}") from error
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity: null stands for it."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _count(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive whole number")
+    return int(text)

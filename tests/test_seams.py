@@ -124,11 +124,11 @@ def test_sums_to_the_root(seed, n):
     parent = order[parent[np.argsort(order)]]
     values = np.where(parent == np.arange(n), 0, rng.standard_normal(n))
     expected = []
-    for i in range(n):
-        expected.append(0.0)
-        while parent[i] != i:
-            expected[-1] += values[i]
-            i = parent[i]
+    for node in range(n):
+        path = [node]
+        while parent[path[-1]] != path[-1]:
+            path.append(parent[path[-1]])
+        expected.append(values[path].sum())
     np.testing.assert_allclose(_sums_to_the_root(parent, values), expected, atol=1e-12)
 
 

@@ -5,10 +5,10 @@
 2. Each component is cut along a graph that leaves a disk (libigl), a sphere along a path between
    two vertices that are far from each other.
 3. Such seams are as short as topology allows, and the map would be stretched beyond use. So they
-   are extended as in Gu, Gortler and Hoppe, "Geometry images", 2002: flatten, cut from the worst
-   place to the seam along the shortest path of edges, and repeat while it pays. To flatten, ten
-   local/global iterations on the ARAP energy (Liu et al. 2008) are enough: that energy is finite
-   also at flips, cheap, and predicts the distortion that SLIM ends with.
+   are extended as in Gu, Gortler and Hoppe, "Geometry images", 2002: flatten, cut along the
+   shortest path of edges to the seam from where that promises most, and repeat while it pays. To
+   flatten, ten local/global iterations on the ARAP energy (Liu et al. 2008) are enough: that
+   energy is finite also at flips, cheap, and predicts the distortion that SLIM ends with.
 """
 
 from __future__ import annotations
@@ -150,17 +150,31 @@ def _path_across(mesh: Mesh) -> np.ndarray:
 
 
 def _path_to_seam(mesh: Mesh, density: Float[Tensor, "m"]) -> np.ndarray:
-    """The shortest path to the boundary from where a cut promises most; no edge if none does.
+    """The shortest path to the boundary that promises most as a cut.
 
-    That is where the distortion times the square of the distance from the boundary, the area that
-    such a cut can relieve, is largest.
+    That is the one whose length times the integral of the distortion along it is largest; a single
+    vertex if none is inside.
     """
     boundary = mesh.boundary_loops[0].numpy()
     distance, before, _ = csgraph.dijkstra(
         _edge_graph(mesh), indices=boundary, min_only=True, return_predecessors=True
     )
-    around = mesh.sum_at_vertices((mesh.areas * density)[:, None])[:, 0] / mesh.vertex_areas
-    return _walk_back(before, int((around.numpy() * distance**2).argmax()))
+    around = mesh.sum_at_vertices((mesh.areas * density)[:, None] / 3)[:, 0] / mesh.vertex_areas
+    before_or_self = np.where(before < 0, np.arange(mesh.n_vertices), before)
+    steps = around.numpy() * (distance - distance[before_or_self])
+    promise = distance * _sums_to_the_root(before_or_self, steps)
+    return _walk_back(before, int(promise.argmax()))
+
+
+def _sums_to_the_root(parent: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sum of the values from each node of a forest up to its root, whose own value is zero.
+
+    By doubling: each node knows the sum below an ancestor, first its parent, then twice as far.
+    """
+    total, ancestor = values, parent
+    while not np.array_equal(ancestor, parent[ancestor]):
+        total, ancestor = total + total[ancestor], ancestor[ancestor]
+    return total
 
 
 def _walk_back(before: np.ndarray, end: int) -> np.ndarray:

@@ -111,8 +111,54 @@ def cli_trial() -> str:
     return "\n".join(lines)
 
 
+def uv_robustness() -> str:
+    """Cut and mapped meshes, from `tests/benchmarks/uv_robustness.py`."""
+    records = json.loads((RESULTS / "uv_robustness.json").read_text())
+    done = [record for record in records.values() if "error" not in record]
+
+    def spread(values: list[float]) -> str:
+        ordered = sorted(values)
+        middle, ninetieth = ordered[len(ordered) // 2], ordered[int(0.9 * len(ordered))]
+        return f"{middle:.3g} / {ninetieth:.3g} / {ordered[-1]:.3g}"
+
+    rows = {
+        "meshes": f"{len(records)}, of up to {max(r['faces'] for r in done):,} faces",
+        "mapped": f"{len(done)}",
+        "flipped triangles": f"{sum(r['flipped'] for r in done)}",
+        "certified": f"{sum(r['certified'] for r in done)}",
+        "charts, median / 90% / most": spread([r["charts"] for r in done]),
+        "symmetric Dirichlet, median / 90% / worst": spread([r["energy"] for r in done]),
+        "largest max(σ₁, 1/σ₂), median / 90% / worst": spread([r["max_distortion"] for r in done]),
+    }
+    return "\n".join(
+        ["| | |", "|---|---|", *(f"| {name} | {cell} |" for name, cell in rows.items())]
+    )
+
+
+def uv_overlap() -> str:
+    """What keeping overlaps off costs, from `tests/benchmarks/uv_overlap.py`."""
+    result = json.loads((RESULTS / "uv_overlap.json").read_text())
+    ratio = {name: f"{(result[name] - 1) * 100:.3g} %" for name in result if "ratio" in name}
+    times = result["mean_seconds"]
+    rows = {
+        "patches of 500 to 2,000 faces": f"{result['patches']:,}",
+        "flipped triangles": f"{result['flips']}",
+        "overlapping after SLIM alone": f"{result['overlapping_percent']:.3g} %",
+        "certified": f"{result['certified_percent']:.4g} %",
+        "energy above SLIM's, median of those": ratio["energy_ratio_median_of_overlapping"],
+        "energy above SLIM's, 99% of all": ratio["energy_ratio_p99"],
+        "energy above SLIM's, worst": ratio["energy_ratio_worst"],
+        "mean time, of SLIM alone": f"{times['injective'] / times['free']:.2f} ×",
+    }
+    return "\n".join(
+        ["| | |", "|---|---|", *(f"| {name} | {cell} |" for name, cell in rows.items())]
+    )
+
+
 TABLES = {
     "cli_trial": cli_trial,
+    "uv_robustness": uv_robustness,
+    "uv_overlap": uv_overlap,
     "uv_train": uv_train,
     "transforms": transforms,
     "poisson_cost": poisson_cost,

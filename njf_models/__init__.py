@@ -11,10 +11,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from njf_models.features import Shape
     from njf_models.njf import NeuralJacobianField, Prediction
+    from njf_models.pretrained import load_pretrained, parameterize
 
-__all__ = ["NeuralJacobianField", "Prediction", "Shape"]
+__all__ = ["NeuralJacobianField", "Prediction", "Shape", "load_pretrained", "parameterize"]
 
-_HOMES = {"NeuralJacobianField": "njf", "Prediction": "njf", "Shape": "features"}
+_HOMES = {
+    "NeuralJacobianField": "njf",
+    "Prediction": "njf",
+    "Shape": "features",
+    "load_pretrained": "pretrained",
+    "parameterize": "pretrained",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -146,10 +146,11 @@ class Shape:
         mesh: dp.Mesh,
         wks: Float[Tensor, "n k"] | None = None,
         dtype: torch.dtype = torch.float32,
+        solver: dp.PoissonSolver | None = None,
     ) -> Shape:
-        """Factorise the mesh's Laplacian and compute the features of its faces."""
+        """The features of a mesh's faces, and its solver if it is not given."""
         features = face_features(mesh, wks).to(dtype)
-        return cls(mesh, dp.PoissonSolver(mesh), features, mesh.frames.to(dtype))
+        return cls(mesh, solver or dp.PoissonSolver(mesh), features, mesh.frames.to(dtype))
 
     @classmethod
     def concatenate(cls, shapes: Sequence[Shape]) -> Shape:

@@ -1,16 +1,68 @@
-"""Trained weights: loading state dicts, also in the layout of the authors' checkpoints."""
+"""Trained weights: those shipped with this package, and checkpoints of the authors' code."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
+import diffpoisson as dp
 from njf_models.njf import NeuralJacobianField
+from njf_models.uv_network import UVNetwork
+
+_WEIGHTS = Path(__file__).parent / "weights"
 
 _FIELD = "per_face_decoder."
 _ENCODERS = "encoder._DeformationEncoder__module_list."
 _POINTNET = "._PointNetEncoder__pointnet."
+
+
+@cache
+def load_pretrained(name: str = "uv") -> UVNetwork:
+    """A trained network that comes with this package; `card` says what it was trained on.
+
+    Raises:
+        ValueError: there are no weights of that name.
+    """
+    return UVNetwork.load(_file(name, ".safetensors"))
+
+
+def card(name: str = "uv") -> dict[str, Any]:
+    """The card of trained weights: data, licences, split, training and measured errors.
+
+    Raises:
+        ValueError: there are no weights of that name.
+    """
+    return dict(json.loads(_file(name, ".json").read_text()))
+
+
+def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any) -> dp.UVMap:
+    """A flip-free UV map of a surface, from a network's prediction for each chart.
+
+    `diffpoisson.parameterize(mesh, network.predict, ...)`: the prediction is repaired where it
+    flips triangles, polished by SLIM, and replaced by Tutte's embedding where nothing mends it.
+
+    Args:
+        mesh: a surface in space, whose components are topological disks unless `cut`.
+        model: the name of trained weights, or a network.
+        options: of `diffpoisson.parameterize`: cut, injective, tolerance, max_iterations.
+
+    Raises:
+        MeshError: see there.
+    """
+    network = load_pretrained(model) if isinstance(model, str) else model
+    return dp.parameterize(mesh, network.predict, **options)
+
+
+def _file(name: str, suffix: str) -> Path:
+    names = sorted(path.stem for path in _WEIGHTS.glob("*.safetensors"))
+    if name not in names:
+        raise ValueError(f"there are no weights {name!r}, but {', '.join(names) or 'none'}")
+    return _WEIGHTS / f"{name}{suffix}"
 
 
 def from_reference_state_dict(state_dict: Mapping[str, Tensor]) -> NeuralJacobianField:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.certificate import certify, is_simple, orientations
+from diffpoisson.certificate import boxes_apart, certify, count_flips, is_simple, orientations
 from tests import meshes
 
 
@@ -97,6 +97,7 @@ def test_certificate_of_isometry_flip_and_spiral():
     assert identity.injective
     assert identity.energy == pytest.approx(4)
     assert identity.max_distortion == pytest.approx(1)
+    assert identity.mean_distortion == pytest.approx(1)
     assert identity.min_determinant == pytest.approx(1)
 
     mirrored = certify(mesh, mesh.vertices * torch.tensor([-1.0, 1]).double())
@@ -117,3 +118,34 @@ def test_certificate_of_isometry_flip_and_spiral():
     assert wound.n_flipped == 0
     assert not wound.simple_boundary
     assert not wound.injective
+
+
+def test_distortion_of_a_stretch_on_one_side():
+    """Half of the square's area twice as wide: σ = (2, 1) there, (1, 1) elsewhere."""
+    corners = np.array([[0.0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]])
+    faces = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
+    stretched = corners * 1.0
+    stretched[corners[:, 0] == 2, 0] = 3
+    certificate = certify(dp.Mesh(corners, faces), torch.from_numpy(stretched))
+    assert certificate.mean_distortion == pytest.approx(1.5)
+    assert certificate.max_distortion == pytest.approx(2)
+    assert certificate.energy == pytest.approx(((1 + 1 + 1 + 1) + (4 + 1 + 1 / 4 + 1)) / 2)
+
+
+def test_single_precision_is_certified_as_it_stands():
+    """Corners that float32 puts on one line are flat, though their originals were not."""
+    mesh = dp.Mesh(np.array([[0.0, 0], [1, 0], [0.5, 1]]), np.array([[0, 1, 2]]))
+    uv = torch.tensor([[0, 1], [1, 1], [0.5, 1 + 1e-9]], dtype=torch.float64)
+    assert count_flips(mesh, uv) == certify(mesh, uv).n_flipped == 0
+    assert count_flips(mesh, uv.float()) == certify(mesh, uv.float()).n_flipped == 1
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 60), grid=st.booleans())
+def test_boxes_against_all_pairs(seed, n, grid):
+    rng = np.random.default_rng(seed)
+    low = rng.integers(0, 40, (n, 2)).astype(float) if grid else rng.uniform(0, 40, (n, 2))
+    high = low + (rng.integers(0, 3, (n, 2)) if grid else rng.uniform(0, 2, (n, 2)))
+    apart = all(
+        (high[i] < low[j]).any() or (high[j] < low[i]).any() for i in range(n) for j in range(i)
+    )
+    assert boxes_apart(low, high) == apart

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import igl
 import numpy as np
 import pytest
@@ -167,6 +169,27 @@ def test_slim_cannot_start_from_flips() -> None:
     mirrored = tutte(mesh) * torch.tensor([1.0, -1])
     with pytest.raises(dp.MeshError, match=rf"init flips {mesh.n_faces} of {mesh.n_faces} faces"):
         slim(mesh, mirrored)
+
+
+def test_slim_keeps_what_does_not_overlap_injective() -> None:
+    mesh = dp.Mesh(*meshes.disk(2, 6))
+    plain, kept = (slim(mesh, tutte(mesh), injective=flag) for flag in (False, True))
+    assert torch.equal(plain.uv, kept.uv)
+    assert not plain.scaffolded
+    assert not kept.scaffolded
+
+
+def test_slim_cannot_make_an_overlapping_map_injective() -> None:
+    """A map that winds around the origin more than once, without a flip."""
+    angle, radius = np.meshgrid(np.linspace(0, 8, 20), [0.5, 1.0], indexing="ij")
+    flat = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1).reshape(-1, 2)
+    a = 2 * np.arange(19)
+    faces = np.r_[np.c_[a, a + 1, a + 3], np.c_[a, a + 3, a + 2]]
+    mesh = dp.Mesh(np.c_[flat, 0.05 * angle.ravel()], faces)
+    winding = torch.from_numpy(flat)
+    assert math.isfinite(slim(mesh, winding).energies[-1])
+    with pytest.raises(dp.MeshError, match="boundary of init meets itself"):
+        slim(mesh, winding, injective=True)
 
 
 # ------------------------------------------------------- Procrustes

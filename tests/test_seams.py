@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.seams import CutMesh, cut_to_disks
+from diffpoisson.seams import CutMesh, _sums_to_the_root, cut_to_disks
 from tests import meshes
 
 
@@ -114,6 +114,22 @@ def test_extended_seams_beat_those_of_topology():
     before, after = (dp.slim(cut, dp.tutte(cut)).energies[-1] for cut in (bare, extended))
     assert after < 4.5 < before
     assert extended.n_vertices < 1.2 * mesh.n_vertices
+
+
+@given(seed=meshes.seeds, n=st.integers(1, 40))
+def test_sums_to_the_root(seed, n):
+    rng = np.random.default_rng(seed)
+    parent = np.array([rng.integers(0, i + 1) for i in range(n)])  # itself: a root
+    order = rng.permutation(n)
+    parent = order[parent[np.argsort(order)]]
+    values = np.where(parent == np.arange(n), 0, rng.standard_normal(n))
+    expected = []
+    for node in range(n):
+        path = [node]
+        while parent[path[-1]] != path[-1]:
+            path.append(parent[path[-1]])
+        expected.append(values[path].sum())
+    np.testing.assert_allclose(_sums_to_the_root(parent, values), expected, atol=1e-12)
 
 
 def test_dtype_is_kept_and_scale_does_not_matter():

@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
         },
         learning_rate=options.rate,
         steps=options.steps,
-        inputs=kind,
+        inputs={"n_points": options.points, "n_energies": train[0].wks.shape[1] * options.wks},
     )
     trainer = make_trainer(
         options.out,

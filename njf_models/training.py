@@ -207,8 +207,8 @@ class NJFTraining(lightning.LightningModule):
         if self.model.output_dim == 2:
             J = dp.jacobians(batch.shape.mesh, prediction.vertices)
             values["validation/flips"] = count_flips(J).float() / size
-        self.log("validation/loss", loss.total, prog_bar=True, batch_size=size)
-        self.log_dict(values, batch_size=size)
+        self.log("validation/loss", loss.total, prog_bar=True, batch_size=size, sync_dist=True)
+        self.log_dict(values, batch_size=size, sync_dist=True)
 
     def _iterates(self, batch: Batch) -> list[Prediction]:
         return self.model.iterates(batch.shape, self.model.encode(batch.points))

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +17,13 @@ import diffpoisson as dp
 from njf_models import NeuralJacobianField, Shape
 from njf_models.datasets.uv import UVPatch
 from njf_models.evaluation import evaluate_uv, format_table, summarise
+from njf_models.features import Motions
 from njf_models.losses import paper_loss
 from njf_models.report import UVRow, render_checkerboard, save_uv_report
 from njf_models.training import (
     Batch,
     NJFTraining,
+    Objective,
     UVExamples,
     last_checkpoint,
     load_checkpoint,
@@ -68,6 +74,119 @@ def test_training_learns_and_resumes_where_it_stopped(patches, tmp_path):
     assert resumed.global_step == stopped_at + 2 * 3
     model = load_checkpoint(last)
     assert not model.training
+
+
+def test_objectives_without_a_target_or_a_loss(patches):
+    batch = Batch.pack([UVExamples(patches, n_points=16, use_wks=False)[0]])
+    model = NeuralJacobianField(**MODEL)
+    with torch.no_grad():
+        prediction = model(batch.shape, model.encode(batch.points))
+    J = dp.jacobians(batch.shape.mesh, prediction.vertices[0])
+    a, b, c, d = J.double().flatten(1).T
+    det = a * d - b * c
+    chi = (det + torch.sqrt(0.01 + det**2)) / 2
+    energy = (J.double() ** 2).sum((1, 2)) * (1 + 1 / chi**2)
+    areas = batch.shape.mesh.areas.double()
+    distortion = float((areas * (energy / 4).log()).sum() / areas.sum())
+    supervised = float(Objective()(batch, prediction).total)
+    alone = Objective(supervised=None, distortion=2.0)(batch, prediction)
+    mixed = Objective(distortion=0.5)(batch, prediction)
+    assert float(alone.total) == pytest.approx(2 * distortion, rel=1e-4)
+    assert float(mixed.total) == pytest.approx(supervised + 0.5 * distortion, rel=1e-4)
+    assert float(alone.vertices) == 0
+    with pytest.raises(ValueError, match="positive weight"):
+        Objective(supervised=None)
+
+
+def test_unsupervised_training_lowers_distortion(patches, tmp_path):
+    trainer = make_trainer(tmp_path, steps=30, validate_every=15)
+    objective = {"supervised": None, "distortion": 1.0}
+    module = NJFTraining(MODEL, objective, learning_rate=3e-3, steps=30)
+    examples = UVExamples(patches, n_points=32, use_wks=False)
+
+    def distortion():
+        batch = Batch.pack([examples[i] for i in range(6)])
+        with torch.no_grad():
+            return float(module.objective(batch, module._iterates(batch)[-1]).total)
+
+    before = distortion()
+    trainer.fit(module, loader(examples, 3, shuffle=True), loader(examples, 6))
+    assert trainer.global_step == 30
+    assert distortion() < 0.8 * before
+    assert trainer.optimizers[0].param_groups[0]["lr"] < 1e-6  # the cosine ended
+
+
+def test_a_moved_batch_is_that_of_moved_meshes(patches):
+    """Against meshes that are really moved, built anew; mirrored ones with faces reversed."""
+    examples = UVExamples(patches[:3], n_points=16, use_wks=False)
+    batch = Batch.pack([examples[i] for i in range(3)])
+    motions = Motions.random(3, tilt=0.4, log_scale=0.3, generator=torch.Generator().manual_seed(5))
+    moved = batch.moved(motions)
+    assert_close(motions.turns @ motions.turns.mT, torch.eye(3).expand(3, 3, 3))
+    mirrored = torch.linalg.det(motions.turns) < 0
+    assert mirrored.any()
+    assert not mirrored.all()
+    assert (torch.linalg.det(motions.images) < 0).equal(mirrored)
+    features = moved.shape.mesh.split_faces(moved.shape.features)
+    frames = moved.shape.mesh.split_faces(moved.shape.frames)
+    targets = moved.shape.mesh.split_vertices(moved.target)
+    for k, patch in enumerate(patches[:3]):
+        turn, scale = motions.turns[k].double(), motions.scales[k].double()
+        faces = patch.mesh.faces.flip(1) if mirrored[k] else patch.mesh.faces
+        mesh = dp.Mesh(scale * patch.mesh.vertices @ turn.T, faces)
+        expected = Shape.prepare(mesh).features
+        offset = expected[:, :3] - features[k][:, :3]  # another bounding box, another centre
+        assert_close(offset, offset[:1].expand_as(offset), rtol=1e-4, atol=1e-5)
+        assert_close(features[k][:, 3:], expected[:, 3:], rtol=1e-4, atol=1e-5)
+        # A matrix for the moved shape acts on its tangents as its counterpart did before.
+        P = torch.randn(2, 3)
+        before = P @ examples[k].shape.frames
+        image = motions.images[k]
+        assert_close(
+            image @ P @ motions.turns[k].T @ frames[k], image @ before, atol=1e-5, rtol=1e-4
+        )
+        assert_close(targets[k], patch.uv.float() @ image.T, atol=1e-6, rtol=1e-5)
+
+
+DDP = """
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import torch
+from njf_models.training import NJFTraining, UVExamples, loader, make_trainer
+from tests.njf_models.test_training import MODEL, patch
+
+if __name__ == "__main__":
+    processes, folder = int(sys.argv[1]), Path(sys.argv[2])
+    torch.manual_seed(0)
+    module = NJFTraining(MODEL | {"rounds": 2}, {"distortion": 0.1}, steps=4)
+    examples = UVExamples([patch(0), patch(1)], n_points=16, use_wks=False)
+    trainer = make_trainer(folder, steps=4, validate_every=1, processes=processes)
+    trainer.fit(module, loader(examples, 2 // processes), loader(examples, 2 // processes))
+    if trainer.is_global_zero:
+        torch.save(module.model.state_dict(), folder / f"{processes}.pt")
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(tmp_path):
+    """Two patches: one step sees both in one process, or one in each of two."""
+    script = tmp_path / "ddp.py"
+    script.write_text(DDP)
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd()), "OMP_NUM_THREADS": "1"}
+    for processes in (1, 2):
+        command = [sys.executable, str(script), str(processes), str(tmp_path)]
+        run = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=False, timeout=300
+        )
+        assert run.returncode == 0, run.stderr[-3000:]
+    one, two = (torch.load(tmp_path / f"{n}.pt") for n in (1, 2))
+    untrained = NeuralJacobianField(**MODEL, rounds=2).state_dict()
+    assert (one["field.layers.12.weight"] - untrained["field.layers.12.weight"]).abs().max() > 1e-3
+    for name, value in one.items():
+        assert_close(two[name], value, rtol=1e-4, atol=1e-5)
 
 
 def test_no_checkpoint_yet(tmp_path):

@@ -17,9 +17,15 @@ from tests import references
 from tests.njf_models.shapes import bumpy_disk, ellipsoid, prepared, randomised, with_frames_rotated
 
 
-def model_and_code(output_dim=3, centering="area"):
+def model_and_code(output_dim=3, centering="area", **rounds):
     model = NeuralJacobianField(
-        6, 6, code_size=16, output_dim=output_dim, centering=centering, encodes_target=True
+        6,
+        6,
+        code_size=16,
+        output_dim=output_dim,
+        centering=centering,
+        encodes_target=True,
+        **rounds,
     )
     randomised(model)
     clouds = torch.randn(2, 50, 6, dtype=torch.float64)
@@ -31,19 +37,22 @@ def test_untrained_network_is_the_identity_and_its_projection():
     shape = prepared(mesh)
     centred = mesh.vertices - (mesh.vertex_areas[:, None] * mesh.vertices).sum(0) / mesh.areas.sum()
     for output_dim in (3, 2):
-        model = NeuralJacobianField(6, 6, code_size=16, output_dim=output_dim).double()
-        code = model.encode(torch.randn(1, 50, 6, dtype=torch.float64))
-        emitted = model(shape, code).vertices[0]
-        assert_close(emitted, centred[:, :output_dim], rtol=1e-10, atol=1e-10)
+        for rounds in (1, 3):
+            model = NeuralJacobianField(
+                6, 6, code_size=16, output_dim=output_dim, rounds=rounds
+            ).double()
+            code = model.encode(torch.randn(1, 50, 6, dtype=torch.float64))
+            emitted = model(shape, code).vertices[0]
+            assert_close(emitted, centred[:, :output_dim], rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("loss", sorted(LOSSES))
-@pytest.mark.parametrize("output_dim", [2, 3])
+@pytest.mark.parametrize(("output_dim", "rounds"), [(2, 1), (3, 1), (2, 3)])
 @given(seed=st.integers(0, 10**6))
-def test_nothing_depends_on_the_frames(output_dim, loss, seed):
+def test_nothing_depends_on_the_frames(output_dim, rounds, loss, seed):
     """The paper's appendix: predictions, loss and gradients are invariant to the tangent bases."""
     mesh = bumpy_disk(seed)
-    model, code = model_and_code(output_dim)
+    model, code = model_and_code(output_dim, rounds=rounds)
     code = code.detach()
     target = torch.from_numpy(
         np.random.default_rng(seed).standard_normal((mesh.n_vertices, output_dim))
@@ -53,7 +62,8 @@ def test_nothing_depends_on_the_frames(output_dim, loss, seed):
         shape = prepared(framed)
         prediction = model(shape, code)
         total = LOSSES[loss](shape, prediction, target).total
-        gradients = torch.autograd.grad(total, list(model.field.parameters()))
+        parameters = [*model.field.parameters(), *model.corrections.parameters()]
+        gradients = torch.autograd.grad(total, parameters)
         results.append((prediction, total, gradients))
     (plain, loss_plain, grad_plain), (turned, loss_turned, grad_turned) = results
     assert (plain.jacobians - turned.jacobians).abs().max() > 1e-3  # frames do differ
@@ -75,11 +85,42 @@ def test_emitted_map_is_the_best_fit_to_the_predicted_matrices():
         assert_close(phi.detach().numpy(), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("centering", ["area", "vertex"])
-def test_packed_shapes_are_each_alone(centering):
+@pytest.mark.parametrize("shared", [False, True])
+def test_rounds_read_the_map_back_and_correct_it(shared):
+    """Written out on world coordinates, with dense algebra and one concatenated input per face."""
+    mesh = bumpy_disk(2)
+    model, code = model_and_code(2, rounds=3, shared_rounds=shared)
+    assert len(model.corrections) == (1 if shared else 2)
+    shape = prepared(mesh)
+    V, F = mesh.vertices.numpy(), mesh.faces.numpy()
+    projection = torch.eye(3) - mesh.normals[:, :, None] * mesh.normals[:, None, :]
+    nets = [model.field, model.corrections[0], model.corrections[-1]]
+    features = shape.features
+    P = torch.eye(2, 3)
+    iterates = model.iterates(shape, code[0])
+    assert len(iterates) == 3
+    for net, iterate in zip(nets, iterates, strict=True):
+        rows = torch.cat([code[0].expand(mesh.n_faces, -1), features], dim=1)
+        P = P + net.layers(rows).unflatten(1, (2, 3))
+        assert_close(iterate.matrices, P.double(), rtol=1e-8, atol=1e-8)
+        phi = references.poisson(V, F, P.detach().numpy())
+        assert_close(iterate.vertices.detach().numpy(), phi, rtol=1e-8, atol=1e-8)
+        J = torch.from_numpy(references.jacobians(V, F, phi))  # on ambient vectors
+        missed = P @ projection - J
+        features = torch.cat([shape.features, J.flatten(1), missed.flatten(1)], dim=1)
+        P = J
+
+
+def test_no_rounds_raise():
+    with pytest.raises(ValueError, match="rounds must be at least 1"):
+        NeuralJacobianField(6, 6, rounds=0)
+
+
+@pytest.mark.parametrize(("centering", "rounds"), [("area", 1), ("vertex", 1), ("area", 2)])
+def test_packed_shapes_are_each_alone(centering, rounds):
     shapes = [prepared(mesh) for mesh in (bumpy_disk(0), ellipsoid(), bumpy_disk(1, 4))]
     union = Shape.concatenate(shapes)
-    model, code = model_and_code(2, centering)
+    model, code = model_and_code(2, centering, rounds=rounds)
     codes = torch.randn(3, code.shape[1], dtype=torch.float64)
     packed = model(union, codes)
     for i, shape in enumerate(shapes):
@@ -90,9 +131,10 @@ def test_packed_shapes_are_each_alone(centering):
         )
 
 
-def test_codes_of_one_shape_are_a_batch():
+@pytest.mark.parametrize("rounds", [1, 2])
+def test_codes_of_one_shape_are_a_batch(rounds):
     shape = prepared(ellipsoid())
-    model, code = model_and_code()
+    model, code = model_and_code(rounds=rounds)
     batch = model(shape, code)
     assert batch.vertices.shape == (2, shape.mesh.n_vertices, 3)
     for i in range(2):

@@ -47,6 +47,20 @@ _OF_FACES = (
 )
 
 
+# Cached properties whose values for a union are those of its parts, one after the other.
+_OF_PARTS = (
+    "_corners",
+    "_double_measures",
+    "_double_frames",
+    "_double_vertex_measures",
+    "measures",
+    "frames",
+    "vertex_measures",
+    "normals",
+    "vertex_normals",
+)
+
+
 class Mesh:
     """An immutable mesh: triangles in the plane (D = 2) or in space (D = 3), or tetrahedra.
 
@@ -350,6 +364,10 @@ class Mesh:
             _concatenate_offsets([mesh.vertex_offsets for mesh in meshes]),
             _concatenate_offsets([mesh.face_offsets for mesh in meshes]),
         )
+        for name in _OF_PARTS:
+            if all(name in mesh.__dict__ for mesh in meshes):
+                with outside_transforms():
+                    union.__dict__[name] = torch.cat([mesh.__dict__[name] for mesh in meshes])
         return union
 
     @property

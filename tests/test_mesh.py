@@ -503,3 +503,20 @@ def test_boundary_that_touches_itself_is_named():
     mesh = dp.Mesh(*meshes.bowtie())
     with pytest.raises(dp.MeshError, match=r"passes 1 vertex \[0\] more than once"):
         _ = mesh.boundary_loops
+
+
+@pytest.mark.parametrize("make", [meshes.disk, meshes.torus, meshes.parts])
+def test_a_union_takes_over_what_its_parts_have_computed(make):
+    used = [dp.Mesh(*make(seed)) for seed in (0, 1)]
+    fresh = dp.Mesh.concatenate([dp.Mesh(*make(seed)) for seed in (0, 1)])
+    names = ("measures", "frames", "vertex_measures", "normals", "vertex_normals", "_corners")
+    for mesh in used:
+        for name in (*names, "_double_measures", "_double_frames", "_double_vertex_measures"):
+            getattr(mesh, name)
+    union = dp.Mesh.concatenate(used)
+    for name in names:
+        assert name in union.__dict__
+        assert torch.equal(getattr(union, name), getattr(fresh, name))
+    partly = dp.Mesh.concatenate([used[0], dp.Mesh(*make(1))])
+    assert "measures" not in partly.__dict__
+    assert torch.equal(partly.measures, fresh.measures)

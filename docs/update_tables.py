@@ -155,7 +155,64 @@ def uv_overlap() -> str:
     )
 
 
+def uv() -> str:
+    """The UV network on unseen meshes, from `tests/benchmarks/uv_results.py`."""
+    results = json.loads((RESULTS / "uv.json").read_text())
+    everything, filtered = results["raw"]["all"], results["raw"]["filtered"]
+    paper = {
+        "patches with a flip, raw, %": "19 / 10",
+        "flips per patch, raw": "3.44 / 0.77",
+        "D>10 per patch, raw": "5.67 / 1.99",
+    }
+    rows = [
+        f"| {name} | {number(filtered[name])} | {number(value)} | {paper.get(name, '–')} |"
+        for name, value in everything.items()
+        if name != "milliseconds per patch, median"
+    ]
+    after, steps, rates = (
+        results[name] for name in ("parameterize", "iterations to 1%, hardest quarter", "rates")
+    )
+    speed = {name: cells[1] for name, cells in rates["patches per second"].items()}
+    more = {
+        "after `parameterize`: patches with a flip": after["patches with a flip"],
+        "not certified": after["not certified"],
+        "started from the network's map, %": 100 * after["from the network"],
+        "energy over converged SLIM's, median": f"{after['energy over SLIM, median']:.5f}",
+        "energy over converged SLIM's, 99%": f"{after['energy over SLIM, p99']:.5f}",
+        "SLIM iterations to 1%, hardest quarter: from Tutte's map": steps["from Tutte"],
+        "the same from the network's": steps["ours"],
+        "raw maps over 20 SLIM iterations, patches per second": rates["prepared over SLIM"],
+        "the same from (V, F), with Tutte's map": rates["from (V, F) over Tutte and SLIM"],
+    }
+    rows += [
+        f"| {name} | | {value if isinstance(value, str) else number(value)} | – |"
+        for name, value in more.items()
+    ]
+    head = f"| {results['patches']} patches of {len(results['meshes'])} unseen meshes"
+    speeds = ", ".join(f"{name} {number(value)}" for name, value in speed.items())
+    return "\n".join(
+        [
+            f"{head} | filtered | all | paper, other data |",
+            "|---|---|---|---|",
+            *rows,
+            "",
+            f"Patches per second on {rates['threads']} thread(s), {rates['faces per patch']:.0f} "
+            f"faces per patch, medians of {rates['rounds']} turns: {speeds}.",
+        ]
+    )
+
+
+def uv_card() -> str:
+    """The card of the shipped weights."""
+    weights = DOCS.parent / "njf_models" / "weights"
+    card = json.loads((weights / "uv.json").read_text())
+    plain = {name: value for name, value in card.items() if isinstance(value, (str, int, float))}
+    return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
+
+
 TABLES = {
+    "uv": uv,
+    "uv_card": uv_card,
     "cli_trial": cli_trial,
     "uv_robustness": uv_robustness,
     "uv_overlap": uv_overlap,

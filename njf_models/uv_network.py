@@ -140,6 +140,16 @@ class UVNetwork:
         network.model.load_state_dict(load_file(path))
         return network
 
+    @classmethod
+    def from_checkpoint(cls, path: Path | str) -> UVNetwork:
+        """The network in a checkpoint of `training.NJFTraining` that records its inputs."""
+        from njf_models.training import NJFTraining  # noqa: PLC0415  (seconds to import)
+
+        trained = NJFTraining.load_from_checkpoint(path, map_location="cpu")
+        network = cls(dict(trained.hparams["model"]), Inputs(**trained.hparams["inputs"]))
+        network.model.load_state_dict(trained.model.state_dict())
+        return network
+
 
 def _require_disk(mesh: dp.Mesh) -> None:
     require_mesh("UVNetwork", mesh)

@@ -167,8 +167,8 @@ def main() -> None:
         "parameterize": {
             "patches with a flip": sum(record["flipped"] > 0 for record in records),
             "not certified": sum(not record["certified"] for record in records),
-            "energy over SLIM's, median": float(np.median(ratio)),
-            "energy over SLIM's, p99": float(np.quantile(ratio, 0.99)),
+            "energy over SLIM, median": float(np.median(ratio)),
+            "energy over SLIM, p99": float(np.quantile(ratio, 0.99)),
             "from the network": float(np.mean(["init" in r["method"] for r in records])),
         },
         "iterations to 1%, hardest quarter": quartile_of_iterations(records),

@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_tensor
 from diffpoisson.certificate import Certificate, certify, orientations
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_mesh
 from diffpoisson.parameterization import slim, tutte
 from diffpoisson.poisson import PoissonSolver
 from diffpoisson.repair import clamp_flips, untangle
@@ -78,6 +79,7 @@ def parameterize(
         MeshError: not a disk in space, or too distorted even for Tutte's embedding.
         ValueError: `init` is not (n, 2) and finite.
     """
+    require_mesh("parameterize", mesh)
     polish = {"tolerance": tolerance, "max_iterations": max_iterations}
     if init is not None:
         _check(mesh, init)
@@ -146,6 +148,7 @@ class _Stages:
 
 
 def _check(mesh: Mesh, init: Tensor) -> None:
+    require_tensor("parameterize", "init", init, mesh.device)
     if init.shape != (mesh.n_vertices, 2):
         raise ValueError(
             f"parameterize: expected init of shape (n={mesh.n_vertices}, 2), "

@@ -83,26 +83,34 @@ class Mutant:
     change: str
     statement: str
     lines: range
-    code: CodeType
-    source: str
 
     @property
     def key(self) -> tuple[str, int, int, str]:
         return self.file, self.line, self.column, self.change
 
 
-def mutants(file: str, path: Path) -> Iterator[Mutant]:
+def mutants(file: str, text: str) -> Iterator[Mutant]:
     """All mutants of a file, in the order of its text."""
-    tree = ast.parse(path.read_text())
-    for node, statement in list(_code(tree, None)):
-        text, lines = _short(statement), _own_lines(statement)
-        for change, do, undo in _changes(node):
+    for node, statement, change, _ in _all_changes(ast.parse(text)):
+        place = node.lineno, node.col_offset
+        yield Mutant(file, *place, change, _short(statement), _own_lines(statement))
+
+
+def mutated(mutant: Mutant, text: str) -> ast.Module:
+    """The file with one change."""
+    tree = ast.parse(text)
+    for node, _, change, do in _all_changes(tree):
+        if (node.lineno, node.col_offset, change) == (mutant.line, mutant.column, mutant.change):
             do()
-            ast.fix_missing_locations(tree)
-            code = compile(tree, str(path), "exec")
-            at = (file, node.lineno, node.col_offset)
-            yield Mutant(*at, change, text, lines, code, ast.unparse(tree))
-            undo()
+            return ast.fix_missing_locations(tree)
+    raise ValueError(f"no such mutant: {mutant}")
+
+
+def _all_changes(tree: ast.Module) -> Iterator[tuple[Any, Any, str, Callable[[], None]]]:
+    """Node, its statement, a change and what makes it."""
+    for node, statement in _code(tree, None):
+        for change, do in _changes(node):
+            yield node, statement, change, do
 
 
 def _code(node: ast.AST, statement: Any) -> Iterator[tuple[Any, Any]]:
@@ -128,38 +136,37 @@ def _own_lines(statement: Any) -> range:
     return range(statement.lineno, max(end, statement.lineno + 1))
 
 
-def _changes(node: Any) -> Iterator[tuple[str, Any, Any]]:
-    def swap(owner: Any, field: str, new: Any) -> tuple[Any, Any]:
-        old = getattr(owner, field)
-        return (lambda: setattr(owner, field, new), lambda: setattr(owner, field, old))
+def _changes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
+    def swap(owner: Any, field: str, new: Any) -> Callable[[], None]:
+        return lambda: setattr(owner, field, new)
 
     if isinstance(node, ast.Compare) and len(node.ops) == 1:
         new = COMPARISONS[type(node.ops[0])]()
-        yield f"{_short(node)} with {type(new).__name__}", *swap(node, "ops", [new])
+        yield f"{_short(node)} with {type(new).__name__}", swap(node, "ops", [new])
     elif isinstance(node, (ast.BinOp, ast.AugAssign)) and type(node.op) in ARITHMETIC:
         new_op = ARITHMETIC[type(node.op)]()
-        yield f"{_short(node)} with {type(new_op).__name__}", *swap(node, "op", new_op)
+        yield f"{_short(node)} with {type(new_op).__name__}", swap(node, "op", new_op)
     elif isinstance(node, ast.BoolOp):
         new_op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
-        yield f"{_short(node)} with {type(new_op).__name__}", *swap(node, "op", new_op)
+        yield f"{_short(node)} with {type(new_op).__name__}", swap(node, "op", new_op)
     elif isinstance(node, ast.UnaryOp) and not isinstance(node.operand, ast.Constant):
         twice = ast.UnaryOp(node.op, node.operand)
-        yield f"{_short(node)} without {type(node.op).__name__}", *swap(node, "operand", twice)
+        yield f"{_short(node)} without {type(node.op).__name__}", swap(node, "operand", twice)
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
-        yield f"not {node.value}", *swap(node, "value", not node.value)
+        yield f"not {node.value}", swap(node, "value", not node.value)
     elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
-        yield f"{node.value} + 1", *swap(node, "value", node.value + 1)
+        yield f"{node.value} + 1", swap(node, "value", node.value + 1)
     elif isinstance(node, (ast.If, ast.IfExp)):
         for value in (True, False):
-            yield f"if {value} for {_short(node.test)}", *swap(node, "test", ast.Constant(value))
+            yield f"if {value} for {_short(node.test)}", swap(node, "test", ast.Constant(value))
     elif isinstance(node, ast.Expr):  # a call for its effect
-        yield f"without {_short(node)}", *swap(node, "value", ast.Constant(None))
+        yield f"without {_short(node)}", swap(node, "value", ast.Constant(None))
     elif (
         isinstance(node, ast.Call)
         and isinstance(node.func, ast.Attribute)
         and not (node.args or node.keywords)
     ):  # x.contiguous() and the like
-        yield f"{_short(node)} without the call", *swap(node, "func", _identity(node.func))
+        yield f"{_short(node)} without the call", swap(node, "func", _identity(node.func))
 
 
 def _identity(method: ast.Attribute) -> ast.Lambda:
@@ -339,15 +346,19 @@ def _probe(file: str, statement: ast.stmt) -> ast.stmt:
 # ------------------------------------------------------- the run
 
 
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
 class Run:
     """All mutants of some files, their outcomes so far, and the tests for each."""
 
     def __init__(self, copy: Path, files: list[str], seconds: float, state: Path) -> None:
         self.copy, self.seconds, self.state = copy, seconds, state
         self.package = copy / "diffpoisson"
-        texts = {file: (self.package / f"{file}.py").read_bytes() for file in files}
-        self.hashes = {file: hashlib.sha256(text).hexdigest()[:12] for file, text in texts.items()}
-        self.all = [m for file in files for m in mutants(file, self.package / f"{file}.py")]
+        self.texts = {file: (self.package / f"{file}.py").read_text() for file in files}
+        self.hashes = {file: _hash(text) for file, text in self.texts.items()}
+        self.all = [m for file, text in self.texts.items() for m in mutants(file, text)]
         self.done: dict[tuple[str, int, int, str], dict[str, Any]] = {}
         self.population = {file: sum(m.file == file for m in self.all) for file in files}
         self.load()
@@ -358,7 +369,7 @@ class Run:
             return
         earlier = json.loads(self.state.read_text())
         current = {
-            file: hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+            file: _hash(path.read_text())
             for file in earlier["sources"]
             if (path := self.package / f"{file}.py").exists()
         }
@@ -426,7 +437,9 @@ def exchanged(run: Run, todo: list[Mutant], recorder: Recorder, items: list[pyte
 
         def work(mutant: Mutant = mutant, tests: list[str] = tests) -> int:
             quiet()
-            exchange(functions[mutant.file], mutant.code)
+            tree = mutated(mutant, run.texts[mutant.file])
+            path = run.package / f"{mutant.file}.py"
+            exchange(functions[mutant.file], compile(tree, str(path), "exec"))
             return fails([by_id[test] for test in tests])
 
         code = fork(work, 30 + int(3 * run.seconds))
@@ -440,7 +453,7 @@ def reimported(run: Run, todo: list[Mutant], recorder: Recorder) -> None:
         tests = run.tests(mutant, recorder)
         files = sorted({test.split("::")[0] for test in tests})
         path = run.package / f"{mutant.file}.py"
-        original = path.read_text()
+        original = run.texts[mutant.file]
 
         def work(tests: list[str] = tests, files: list[str] = files) -> int:
             quiet()
@@ -453,7 +466,7 @@ def reimported(run: Run, todo: list[Mutant], recorder: Recorder) -> None:
             collect(run.copy, files, Session(check))
             return 0 if found == [False] else 1
 
-        path.write_text(mutant.source)
+        path.write_text(ast.unparse(mutated(mutant, original)))
         code = fork(work, 60 + int(3 * run.seconds))
         path.write_text(original)
         run.finish(mutant, tests, code)

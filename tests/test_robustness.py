@@ -18,6 +18,7 @@ from diffpoisson.gradient import gradient_operator
 from diffpoisson.linear_map import LinearMap
 from tests import meshes
 from tests.benchmarks import leaks
+from tests.benchmarks.conditioning import caps, needles
 from tests.checks import field
 
 # ------------------------------------------------------- NaN stays where it must
@@ -226,14 +227,38 @@ def test_cycles_lose_no_memory():
     assert growth("ours") < 2
 
 
-def test_thin_faces_raise_with_their_name():
-    """Where rounding makes the Laplacian indefinite: never a shift, nor a wrong answer."""
-    vertices, faces = meshes.disk(0, 4)
-    vertices[:, 0] *= 1e-13
-    mesh = dp.Mesh(vertices, faces)
-    try:
-        phi = dp.PoissonSolver(mesh)(dp.jacobians(mesh, mesh.vertices))
-    except dp.MeshError as error:
-        assert "thinnest face" in str(error)  # noqa: PT017 - either ending is right
-    else:
-        assert phi.isfinite().all()
+# ------------------------------------------------------- thin faces
+
+
+@pytest.mark.parametrize("shape", [needles, caps])
+@pytest.mark.parametrize("aspect", [1e2, 1e4, 1e6])
+def test_thin_faces_cost_the_square_of_their_aspect(shape, aspect):
+    """An affine map, which is known; never the error of a shift."""
+    mesh = dp.Mesh(*shape(aspect))
+    areas = mesh.vertex_areas[:, None]
+    expected = mesh.vertices - (areas * mesh.vertices).sum(0) / areas.sum()
+    phi = dp.PoissonSolver(mesh)(dp.jacobians(mesh, mesh.vertices))
+    condition = mesh.n_vertices * aspect**2  # of the Laplacian, roughly
+    assert (phi - expected).abs().max() < torch.finfo(phi.dtype).eps * condition
+
+
+def test_too_thin_faces_are_named():
+    """Where rounding makes the Laplacian indefinite, as on some of these."""
+    messages = []
+    for shape in (needles, caps):
+        for aspect in (1e8, 1e9, 1e10, 1e11):
+            mesh = dp.Mesh(*shape(aspect))
+            try:
+                dp.PoissonSolver(mesh)
+            except dp.MeshError as error:
+                messages.append((_thinnest(mesh), str(error)))
+    assert messages
+    for thinnest, message in messages:
+        assert f"thinnest face, {thinnest}, has a height of" in message
+
+
+def _thinnest(mesh: dp.Mesh) -> int:
+    """The face with the least height over its longest edge."""
+    corners = mesh.vertices[mesh.faces]
+    longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).max(dim=1).values
+    return int((mesh.areas / longest**2).argmin())

@@ -5,7 +5,7 @@
 Each mutant changes one operator, constant, condition or statement of one file. The tests are
 collected once, and run once to see which executes which line. Then a child process is forked for
 each mutant: it exchanges the code of the changed functions, and runs the tests that execute the
-changed line, first the fastest case of each test function, until one fails. A mutant survives if
+changed line, first the fastest on each path through the file, until one fails. A mutant survives if
 all pass, or if none fails in `--seconds` of tests. What runs at import (defaults, class bodies,
 constants) can't be exchanged: such mutants are written to a copy of the repository, and the tests
 collected anew. The same command goes on where it was interrupted; mutants of a file that has
@@ -387,7 +387,7 @@ class Run:
         return [mutant for mutant in self.all if mutant.key not in self.done]
 
     def tests(self, mutant: Mutant, recorder: Recorder) -> list[str]:
-        """Those that execute the changed line: each function's fastest case, then each second."""
+        """Those that execute the changed line: the fastest on each path, then each path's second."""
         places = {(mutant.file, mutant.lines[0])}
         if self.at_import(mutant, recorder):
             places = {
@@ -395,11 +395,11 @@ class Run:
             }
         touching = [test for test, found in recorder.reached.items() if found & places]
         touching.sort(key=recorder.seconds.__getitem__)
-        met: Counter[str] = Counter()  # how often each function was met
+        met: Counter[frozenset[tuple[str, int]]] = Counter()  # how often each path was met
         rank = {}
         for test in touching:
-            function = test.split("[")[0]
-            rank[test], met[function] = met[function], met[function] + 1
+            path = frozenset(p for p in recorder.reached[test] if p[0] == mutant.file)
+            rank[test], met[path] = met[path], met[path] + 1
         chosen, total = [], 0.0
         for test in sorted(touching, key=lambda test: (rank[test], recorder.seconds[test])):
             total += recorder.seconds[test]

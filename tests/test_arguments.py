@@ -145,9 +145,9 @@ def test_refinements():
     """They change nothing but roundings, under constraints too, and raise with moving geometry."""
     mesh = dp.Mesh(*meshes.parts())
     R = torch.randn(mesh.n_faces, 3, 3, dtype=torch.float64)
-    pins, handles = torch.tensor([1, 4]), torch.tensor([30])
+    pins, handles = torch.tensor([1, 4]), torch.tensor([2, 30, 33])  # they pull against faces
     solver = dp.PoissonSolver(mesh, pins=pins, handles=handles, handle_weights=3.0)
-    images = {"pins": torch.randn(2, 3).double(), "handles": torch.randn(1, 3).double()}
+    images = {"pins": torch.randn(2, 3).double(), "handles": torch.randn(3, 3).double()}
     for given in (R, torch.stack([R, 2 * R])):
         expected = solver(given, **images)
         torch.testing.assert_close(solver(given, **images, refinements=2), expected)

@@ -503,3 +503,29 @@ def test_boundary_that_touches_itself_is_named():
     mesh = dp.Mesh(*meshes.bowtie())
     with pytest.raises(dp.MeshError, match=r"passes 1 vertex \[0\] more than once"):
         _ = mesh.boundary_loops
+
+
+@pytest.mark.parametrize("name", SPATIAL)
+def test_vertex_normals_against_libigl(name):
+    mesh = dp.Mesh(*TOPOLOGIES[name]())
+    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
+    normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA)
+    np.testing.assert_allclose(mesh.vertex_normals, normals, rtol=0, atol=1e-12)
+
+
+def test_vertex_normals_that_cancel_are_zero():
+    """Two faces back to back, with coordinates that do not round."""
+    mesh = dp.Mesh(V[:3], np.array([[0, 1, 2], [0, 2, 1]]))
+    assert torch.equal(mesh.vertex_normals, torch.zeros(3, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_arrays_are_copied(kind):
+    """Later edits by the caller must not reach the mesh, nor one that was moved."""
+    vertices, faces = (kind(x.tolist()) for x in meshes.disk())
+    mesh = dp.Mesh(vertices, faces)
+    moved = mesh.with_vertices(positions := mesh.vertices * 2)
+    before = mesh.vertices.clone(), mesh.faces.clone(), moved.vertices.clone()
+    vertices[:], faces[:], positions[:] = 0, 0, 0
+    assert all(map(torch.equal, (mesh.vertices, mesh.faces, moved.vertices), before))
+    assert (mesh.vertex_offsets, mesh.face_offsets) == ((0, len(vertices)), (0, len(faces)))

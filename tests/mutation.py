@@ -387,7 +387,7 @@ class Run:
         return [mutant for mutant in self.all if mutant.key not in self.done]
 
     def tests(self, mutant: Mutant, recorder: Recorder) -> list[str]:
-        """Those that execute the changed line: the fastest on each path, then each path's second."""
+        """Those that execute the changed line: the fastest on each path, then the next."""
         places = {(mutant.file, mutant.lines[0])}
         if self.at_import(mutant, recorder):
             places = {

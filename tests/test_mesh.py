@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
+from diffpoisson.mesh import require_cells
 from tests import meshes, references
 from tests.meshes import SPATIAL, TOPOLOGIES
 
@@ -529,3 +530,48 @@ def test_arrays_are_copied(kind):
     vertices[:], faces[:], positions[:] = 0, 0, 0
     assert all(map(torch.equal, (mesh.vertices, mesh.faces, moved.vertices), before))
     assert (mesh.vertex_offsets, mesh.face_offsets) == ((0, len(vertices)), (0, len(faces)))
+
+
+def test_moved_positions_without_area_are_refused():
+    vertices, faces = torch.from_numpy(V), torch.from_numpy(F)
+    require_cells("f", None, faces)
+    require_cells("f", vertices.float(), faces)
+    for value, culprits in ((V[0], [1, 3]), (np.nan, [1, 2, 3])):
+        moved = torch.from_numpy(placed(V, 3, value))
+        with pytest.raises(dp.MeshError, match=re.escape(f"{len(culprits)} faces {culprits}")):
+            require_cells("f", moved, faces)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda m: m.to(3), TypeError, "Mesh.to: expected a dtype or a device, got int"),
+        (lambda m: m.with_vertices(V), TypeError, "Mesh.with_vertices: vertices must be a torch"),
+        (lambda m: dp.Mesh.concatenate([m, 3]), TypeError, "Mesh.concatenate: expected a list of"),
+        (
+            lambda m: dp.Mesh(torch.from_numpy(V), torch.from_numpy(F).to("meta")),
+            dp.MeshError,
+            "Mesh: vertices are on cpu, faces on meta",
+        ),
+        (
+            lambda m: dp.Mesh(torch.from_numpy(V).to_sparse(), F),
+            dp.MeshError,
+            "Mesh: vertices must",
+        ),
+        (lambda m: m.to("meta"), dp.MeshError, "Mesh: vertices must be a dense tensor"),
+        (
+            lambda m: dp.Mesh.cleaned(torch.from_numpy(V).requires_grad_(), F),
+            dp.MeshError,
+            "Mesh: vertices require grad",
+        ),
+    ],
+)
+def test_arguments_of_other_kinds(call, error, message):
+    with pytest.raises(error, match="^" + re.escape(message)):
+        call(dp.Mesh(V, F))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
+def test_narrow_indices(dtype):
+    assert dp.Mesh(V, F.astype(dtype)).faces.dtype == torch.int64

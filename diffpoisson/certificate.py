@@ -70,7 +70,7 @@ def certify(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Certificate:
         )
     if not uv.isfinite().all():
         raise ValueError("certify: uv has entries that are not finite")
-    J = jacobians(mesh, uv)
+    J = jacobians(mesh, uv.detach())
     density = symmetric_dirichlet(J).double()
     areas = mesh._double_measures
     points = uv.detach().cpu().double().numpy()
@@ -85,7 +85,10 @@ def certify(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Certificate:
 
 
 def orientations(triangles: Float[np.ndarray, "m 3 2"]) -> np.ndarray:
-    """Exact sign of each triangle's area, (m,): 1 counter-clockwise, 0 flat, -1 clockwise."""
+    """Exact sign of each triangle's area, (m,): 1 counter-clockwise, -1 clockwise, else 0.
+
+    A triangle that is not finite has sign 0, as a flat one.
+    """
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     with np.errstate(over="ignore", invalid="ignore"):  # beyond the range of floats: unsure
         left = (a[:, 0] - c[:, 0]) * (b[:, 1] - c[:, 1])
@@ -93,7 +96,8 @@ def orientations(triangles: Float[np.ndarray, "m 3 2"]) -> np.ndarray:
         difference, magnitude = left - right, np.abs(left) + np.abs(right)
     unsure = ~(np.abs(difference) > _ORIENTATION_BOUND * magnitude)
     signs = np.sign(np.where(unsure, 0, difference)).astype(int)
-    for i in np.flatnonzero(unsure):  # few: nearly collinear corners
+    finite = np.isfinite(triangles).all((1, 2))
+    for i in np.flatnonzero(unsure & finite):  # few: nearly collinear corners
         signs[i] = _exact_orientation(triangles[i])
     return signs
 

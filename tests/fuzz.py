@@ -873,6 +873,7 @@ def run(n: int, seed: int, workers: int, state: Path | None, timeout: float = 12
             summary = before | {"findings": []}
             for finding in before["findings"]:
                 _move(summary, finding["outcome"], run_case(seed, finding["index"]))
+            _save(summary, state)
     with tqdm(total=n, initial=summary["done"], disable=not sys.stderr.isatty()) as bar:
         while summary["done"] < n:
             first, last = summary["done"], min(summary["done"] + chunk, n)
@@ -885,9 +886,13 @@ def run(n: int, seed: int, workers: int, state: Path | None, timeout: float = 12
                     bar.update()
             summary["done"] = last
             if state:
-                state.parent.mkdir(parents=True, exist_ok=True)
-                state.write_text(json.dumps(summary, indent=1) + "\n")
+                _save(summary, state)
     return summary
+
+
+def _save(summary: dict[str, Any], state: Path) -> None:
+    state.parent.mkdir(parents=True, exist_ok=True)
+    state.write_text(json.dumps(summary, indent=1) + "\n")
 
 
 def _count(summary: dict[str, Any], record: dict[str, Any]) -> None:

@@ -288,6 +288,12 @@ def test_maps_that_are_not_finite_get_no_certificate():
     uv[3, 1] = torch.nan
     with pytest.raises(ValueError, match=r"^certify: uv has entries that are not finite"):
         dp.certify(mesh, uv)
+    assert (orientations(uv[mesh.faces].numpy()) == 0).tolist() == (mesh.faces == 3).any(1).tolist()
+
+
+def test_certificates_need_no_graph():
+    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
+    assert dp.certify(mesh, mesh.vertices.clone().requires_grad_()).injective
 
 
 @pytest.mark.usefixtures("unchecked")

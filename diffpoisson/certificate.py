@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import require_single_or_double, require_tensor
 from diffpoisson.distortion import determinant, isometric_distortion, symmetric_dirichlet
 from diffpoisson.gradient import jacobians
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_mesh
 
 # A computed orientation (a - c) × (b - c) has the right sign if it exceeds 3u + 16u² times the sum
 # of the magnitudes of its two products, u the unit roundoff (Shewchuk 1997).
@@ -58,8 +59,21 @@ def certify(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> Certificate:
     Args:
         mesh: a topological disk.
         uv: (n, 2) the map.
+
+    Raises:
+        TypeError: not a mesh, or uv no tensor of floating-point numbers.
+        ValueError: uv is not (n, 2) and finite, or on another device.
     """
-    J = jacobians(mesh, uv.double())
+    require_mesh("certify", mesh)
+    require_tensor("certify", "uv", uv, mesh.device)
+    require_single_or_double("certify", "uv", uv)
+    if uv.shape != (mesh.n_vertices, 2):
+        raise ValueError(
+            f"certify: expected uv of shape (n={mesh.n_vertices}, 2), got {tuple(uv.shape)}"
+        )
+    if not uv.isfinite().all():
+        raise ValueError("certify: uv has entries that are not finite")
+    J = jacobians(mesh, uv.detach().double())
     distortion = isometric_distortion(J)
     density = symmetric_dirichlet(J)
     areas = mesh._double_measures / mesh._double_measures.sum()
@@ -82,13 +96,19 @@ def count_flips(mesh: Mesh, uv: Float[Tensor, "n 2"]) -> int:
 
 
 def orientations(triangles: Float[np.ndarray, "m 3 2"]) -> np.ndarray:
-    """Exact sign of each triangle's area, (m,): 1 counter-clockwise, 0 flat, -1 clockwise."""
+    """Exact sign of each triangle's area, (m,): 1 counter-clockwise, -1 clockwise, else 0.
+
+    A triangle that is not finite has sign 0, as a flat one.
+    """
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    left = (a[:, 0] - c[:, 0]) * (b[:, 1] - c[:, 1])
-    right = (a[:, 1] - c[:, 1]) * (b[:, 0] - c[:, 0])
-    signs = np.sign(left - right).astype(int)
-    unsure = np.abs(left - right) <= _ORIENTATION_BOUND * (np.abs(left) + np.abs(right))
-    for i in np.flatnonzero(unsure):  # few: nearly collinear corners
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond the range of floats: unsure
+        left = (a[:, 0] - c[:, 0]) * (b[:, 1] - c[:, 1])
+        right = (a[:, 1] - c[:, 1]) * (b[:, 0] - c[:, 0])
+        difference, magnitude = left - right, np.abs(left) + np.abs(right)
+    unsure = ~(np.abs(difference) > _ORIENTATION_BOUND * magnitude)
+    signs = np.sign(np.where(unsure, 0, difference)).astype(int)
+    finite = np.isfinite(triangles).all((1, 2))
+    for i in np.flatnonzero(unsure & finite):  # few: nearly collinear corners
         signs[i] = _exact_orientation(triangles[i])
     return signs
 
@@ -146,7 +166,8 @@ def _any_improper_contact(polygon: np.ndarray, i: np.ndarray, j: np.ndarray) -> 
     first = np.where((j == i + 1)[:, None], a, b)[adjacent]
     other = np.where((j == i + 1)[:, None], d, c)[adjacent]
     collinear = orientations(np.stack([first, shared, other], axis=1)) == 0
-    folded = ((first - shared) * (other - shared)).sum(-1) >= 0
+    # The signs of the products, which at extreme scales leave the range of floats.
+    folded = (np.sign(first - shared) * np.sign(other - shared)).sum(-1) >= 0
     return bool((collinear & folded).any())
 
 

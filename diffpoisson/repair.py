@@ -13,6 +13,7 @@ the flips of what comes back.
 from __future__ import annotations
 
 import math
+import numbers
 
 import numpy as np
 import scipy.optimize
@@ -20,9 +21,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.arguments import (
+    require_instances,
+    require_integer,
+    require_single_or_double,
+    require_tensor,
+)
 from diffpoisson.distortion import area_distortion, determinant, flipped, mips, similarity_parts
 from diffpoisson.gradient import jacobians
-from diffpoisson.mesh import Mesh
+from diffpoisson.mesh import Mesh, require_mesh
 from diffpoisson.poisson import PoissonSolver
 
 
@@ -35,8 +42,18 @@ def clamp_singular_values(
     both.
 
     Raises:
-        ValueError: not 0 < smallest <= largest.
+        TypeError: J is no tensor of float32 or float64, or a limit no number.
+        ValueError: J is not (…, 2, 2), or not 0 < smallest <= largest.
     """
+    require_tensor("clamp_singular_values", "J", J)
+    require_single_or_double("clamp_singular_values", "J", J)
+    if J.shape[-2:] != (2, 2):
+        shape = tuple(J.shape)
+        raise ValueError(f"clamp_singular_values: expected J of shape (…, 2, 2), got {shape}")
+    for name, limit in (("smallest", smallest), ("largest", largest)):
+        if not isinstance(limit, numbers.Real):
+            got = type(limit).__name__
+            raise TypeError(f"clamp_singular_values: {name} must be a number, got {got}")
     if not 0 < smallest <= largest:
         raise ValueError(
             f"clamp_singular_values: need 0 < smallest <= largest, got {smallest}, {largest}"
@@ -75,7 +92,14 @@ def clamp_flips(
 
     Returns:
         The map, and the number of solves.
+
+    Raises:
+        TypeError: arguments of other types.
+        ValueError: uv is not (n, 2), or a negative number of rounds.
     """
+    require_instances("clamp_flips", [solver], PoissonSolver)
+    _require_map("clamp_flips", solver.mesh, uv)
+    require_integer("clamp_flips", "max_rounds", max_rounds, 0)
     for rounds in range(max_rounds + 1):
         J = jacobians(solver.mesh, uv)
         if rounds == max_rounds or not flipped(J).any():
@@ -97,7 +121,15 @@ def untangle(
 
     Returns:
         The map, in the dtype of uv, and the number of rounds.
+
+    Raises:
+        TypeError: arguments of other types.
+        ValueError: uv is not (n, 2), or a negative number of rounds or iterations.
     """
+    require_mesh("untangle", mesh)
+    _require_map("untangle", mesh, uv)
+    require_integer("untangle", "max_rounds", max_rounds, 0)
+    require_integer("untangle", "iterations", iterations, 0)
     areas = mesh._double_measures / mesh._double_measures.sum()
     x = uv.detach().double()
     for rounds in range(max_rounds + 1):
@@ -146,3 +178,12 @@ def _descend(
         options={"maxiter": iterations, "maxcor": 10},
     )
     return torch.from_numpy(result.x).view_as(uv)
+
+
+def _require_map(operation: str, mesh: Mesh, uv: Tensor) -> None:
+    require_tensor(operation, "uv", uv, mesh.device)
+    require_single_or_double(operation, "uv", uv)
+    if uv.shape != (mesh.n_vertices, 2):
+        raise ValueError(
+            f"{operation}: expected uv of shape (n={mesh.n_vertices}, 2), got {tuple(uv.shape)}"
+        )

@@ -84,17 +84,16 @@ def poisson_cost() -> str:
 def mutations() -> str:
     """Mutants of each file: how many there are, how many were run, and what came of them."""
     result = json.loads((RESULTS / "mutations.json").read_text())
+    population = result["population"]
     counts = Counter((mutant["file"], mutant["outcome"]) for mutant in result["mutants"])
-    files = sorted({file for file, _ in counts})
-    columns = [(file, counts[file, "killed"], counts[file, "survived"]) for file in files]
-    rows = [
-        f"| `{file}.py` | {result['population'].get(file, '–')} | {killed + survived} | {killed} "
-        f"| {survived} |"
-        for file, killed, survived in columns
-    ]
-    killed, survived = (sum(column[k] for column in columns) for k in (1, 2))
+    rows = []
+    for file, total in population.items():
+        survived = counts[file, "survived"]
+        killed = counts[file, "killed"] + counts[file, "hung"]
+        rows.append((f"`{file}.py`", total, killed + survived, killed, survived))
+    rows.append(("all", *(sum(column) for column in list(zip(*rows, strict=True))[1:])))
     head = "| file | mutants | run | killed | survived |\n|---|---|---|---|---|"
-    return "\n".join([head, *rows, f"| all | | {killed + survived} | {killed} | {survived} |"])
+    return "\n".join([head, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
 
 
 def cli_trial() -> str:

@@ -22,6 +22,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -354,6 +355,52 @@ def check_uv(a: Arguments, uv: Tensor) -> None:
     require(not dp.flipped(dp.jacobians(a["mesh"], uv)).any(), "flips")
 
 
+def check_parameterized(a: Arguments, uvmap: dp.UVMap) -> None:
+    check_uv(a, uvmap.uv)
+    require(uvmap.uv.isfinite().all(), "finite")
+
+
+def check_certificate(a: Arguments, certificate: dp.Certificate) -> None:
+    """Flips are counted as exact fractions say."""
+    corners = a["uv"].double()[a["mesh"].faces].numpy()
+    if not np.isfinite(corners).all():
+        return
+    areas = [_exact_area(triangle) for triangle in corners]
+    require(certificate.n_flipped == sum(area <= 0 for area in areas), "flips")
+
+
+def _exact_area(triangle: np.ndarray) -> Fraction:
+    (ax, ay), (bx, by), (cx, cy) = [[Fraction(x) for x in corner] for corner in triangle.tolist()]
+    return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+
+
+def check_repaired(a: Arguments, result: tuple[Tensor, int]) -> None:
+    """A map of the same shape and dtype, finite; the same where nothing flips."""
+    uv, rounds = result
+    m = a["mesh"] if "mesh" in a else a["solver"].mesh
+    require(uv.shape == a["uv"].shape, "shape")
+    require(uv.dtype == a["uv"].dtype, "dtype")
+    if not sound(a["uv"]):
+        return
+    require(uv.isfinite().all(), "finite")
+    if rounds == 0:
+        require(torch.equal(uv, a["uv"]), "untouched")
+    elif not dp.flipped(dp.jacobians(m, a["uv"])).any():
+        require(False, "rounds without a flip")
+
+
+def check_clamped(a: Arguments, J: Tensor) -> None:
+    """Singular values within the limits."""
+    require(J.shape == a["J"].shape, "shape")
+    if J.numel() == 0 or not sound(a["J"], a["J"].reciprocal()):
+        return
+    values = torch.linalg.svdvals(J.double())
+    tolerance = 100 * unit(J.dtype) * a["largest"]
+    require((values >= a["smallest"] - tolerance).all(), "smallest")
+    require((values <= a["largest"] + tolerance).all(), "largest")
+    require((torch.linalg.det(J.double()) > -tolerance * a["largest"]).all(), "flips")
+
+
 def check_procrustes(a: Arguments, moved: Tensor) -> None:
     require(moved.shape[-2:] == a["source"].shape[-2:], "shape")
     if sound(a["source"], a["target"]) and (a["weights"] > 0).all():
@@ -581,6 +628,46 @@ def _draw_slim(rng: Rng) -> Arguments:
     return {"mesh": m, "init": dp.tutte(m), "tolerance": 1e-3, "max_iterations": 3}
 
 
+def _draw_planar(rng: Rng) -> Arguments:
+    """A disk with a map that is flat, perturbed, or noise."""
+    m = dp.Mesh(*meshes.disk(int(rng.integers(100)), 4))
+    noise = rng.choice([0, 0.2, 1]) * torch.from_numpy(rng.normal(size=(m.n_vertices, 2)))
+    return {"mesh": m, "uv": dp.tutte(m) + noise}
+
+
+def _draw_clamp_flips(rng: Rng) -> Arguments:
+    a = _draw_planar(rng)
+    return {"solver": dp.PoissonSolver(a["mesh"]), "uv": a["uv"], "max_rounds": 3}
+
+
+def _draw_untangle(rng: Rng) -> Arguments:
+    return _draw_planar(rng) | {"max_rounds": 2, "iterations": 5}
+
+
+def _draw_parameterize(rng: Rng) -> Arguments:
+    a = _draw_planar(rng)
+    return {"mesh": a["mesh"], "init": a["uv"], "tolerance": 1e-3, "max_iterations": 3}
+
+
+def _draw_clamped(rng: Rng) -> Arguments:
+    J = torch.from_numpy(rng.normal(size=(int(rng.integers(0, 5)), 2, 2)))
+    return {"J": J, "smallest": 0.25, "largest": float(rng.choice([0.25, 4]))}
+
+
+def _draw_one_shot(rng: Rng) -> Arguments:
+    a = _draw_solve(rng)
+    solver = a.pop("solver")
+    constraints = solver.constraints
+    kept = {"mesh": solver.mesh, "R": a["R"]}
+    return kept | ({"face_weights": constraints.face_weights.clone()} if rng.random() < 0.5 else {})
+
+
+def _check_one_shot(a: Arguments, phi: Tensor) -> None:
+    weights = a.get("face_weights")
+    solver = dp.PoissonSolver(a["mesh"], face_weights=weights)
+    check_solution({"solver": solver, "R": a["R"]}, phi)
+
+
 def _draw_procrustes(rng: Rng) -> Arguments:
     source, target = torch.from_numpy(rng.normal(size=(2, 6, 2)))
     return {
@@ -639,6 +726,12 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "tutte": Operation(_draw_disk, dp.tutte, check_uv, 0.5),
     "slim": Operation(_draw_slim, dp.slim, lambda a, result: check_uv(a, result.uv), 0.5),
+    "solve_poisson": Operation(_draw_one_shot, dp.solve_poisson, _check_one_shot),
+    "parameterize": Operation(_draw_parameterize, dp.parameterize, check_parameterized, 0.3),
+    "certify": Operation(_draw_planar, dp.certify, check_certificate, 0.7),
+    "clamp_flips": Operation(_draw_clamp_flips, dp.clamp_flips, check_repaired, 0.5),
+    "untangle": Operation(_draw_untangle, dp.untangle, check_repaired, 0.3),
+    "clamp_singular_values": Operation(_draw_clamped, dp.clamp_singular_values, check_clamped, 0.4),
     "procrustes": Operation(_draw_procrustes, dp.procrustes, check_procrustes),
     **{
         name: Operation(_draw_density, getattr(dp, name), check_density, 0.4)
@@ -659,6 +752,7 @@ _WEIGHTS = np.array([operation.weight for operation in OPERATIONS.values()])
 _SPEAKERS = (
     *("Mesh", "PoissonSolver", "distortion", "CholeskyFactor", "solve_laplacian", "lumped_mass"),
     *("laplacian_eigenpairs", "singular_values", "areas need", "volumes need", "vertex_areas need"),
+    *("slim", "tutte", "clamp_singular_values", "jacobians"),
 )
 
 
@@ -779,6 +873,7 @@ def run(n: int, seed: int, workers: int, state: Path | None, timeout: float = 12
             summary = before | {"findings": []}
             for finding in before["findings"]:
                 _move(summary, finding["outcome"], run_case(seed, finding["index"]))
+            _save(summary, state)
     with tqdm(total=n, initial=summary["done"], disable=not sys.stderr.isatty()) as bar:
         while summary["done"] < n:
             first, last = summary["done"], min(summary["done"] + chunk, n)
@@ -791,9 +886,13 @@ def run(n: int, seed: int, workers: int, state: Path | None, timeout: float = 12
                     bar.update()
             summary["done"] = last
             if state:
-                state.parent.mkdir(parents=True, exist_ok=True)
-                state.write_text(json.dumps(summary, indent=1) + "\n")
+                _save(summary, state)
     return summary
+
+
+def _save(summary: dict[str, Any], state: Path) -> None:
+    state.parent.mkdir(parents=True, exist_ok=True)
+    state.write_text(json.dumps(summary, indent=1) + "\n")
 
 
 def _count(summary: dict[str, Any], record: dict[str, Any]) -> None:

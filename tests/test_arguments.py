@@ -104,13 +104,50 @@ def test_another_library_s_mesh(name, others):
         getattr(dp, name)(trimesh.creation.box(), *others)
 
 
+MESH = dp.Mesh(*meshes.disk())
+FIELD = dp.jacobians(MESH, MESH.vertices)
+SOLVER = dp.PoissonSolver(MESH)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: SOLVER(FIELD.numpy()), "PoissonSolver: R must be a torch tensor"),
+        (lambda: SOLVER(FIELD, vertices=[0]), "PoissonSolver: vertices must be a torch tensor"),
+        (lambda: SOLVER(FIELD, face_weights=1), "PoissonSolver: face_weights must be a torch"),
+        (lambda: SOLVER(FIELD, refinements=1.5), "PoissonSolver: refinements must be an integer"),
+        (lambda: SOLVER.solve_laplacian([0]), "solve_laplacian: b must be a torch tensor"),
+        (
+            lambda: dp.PoissonSolver.concatenate([MESH]),
+            "PoissonSolver.concatenate: expected a list",
+        ),
+        (lambda: dp.restrict([0], MESH.frames), "restrict: matrices must be a torch tensor"),
+        (lambda: dp.restrict(FIELD, [0]), "restrict: frames must be a torch tensor"),
+        (
+            lambda: dp.restrict(FIELD, MESH.frames[0]),
+            "restrict: expected frames of shape (m, D, d)",
+        ),
+        (lambda: dp.extend([0], MESH.frames), "extend: matrices must be a torch tensor"),
+        (lambda: dp.jacobians(MESH, [0]), "jacobians: phi must be a torch tensor"),
+        (lambda: dp.divergence(MESH, [0]), "divergence: R must be a torch tensor"),
+        (lambda: dp.singular_values([0]), "distortion: J must be a torch tensor"),
+        (lambda: dp.sample_surface(MESH, 1.5), "sample_surface: n_samples must be an integer"),
+        (lambda: dp.laplacian_eigenpairs(MESH, 1.5), "laplacian_eigenpairs: n_eigenpairs must be"),
+        (lambda: MESH.with_vertices([0, 1]), "Mesh"),
+    ],
+)
+def test_operations_name_the_argument(call, message):
+    with pytest.raises((TypeError, ValueError), match="^" + re.escape(message)):
+        call()
+
+
 def test_refinements():
     """They change nothing but roundings, under constraints too, and raise with moving geometry."""
     mesh = dp.Mesh(*meshes.parts())
     R = torch.randn(mesh.n_faces, 3, 3, dtype=torch.float64)
-    pins, handles = torch.tensor([1, 4]), torch.tensor([30])
+    pins, handles = torch.tensor([1, 4]), torch.tensor([2, 30, 33])  # they pull against faces
     solver = dp.PoissonSolver(mesh, pins=pins, handles=handles, handle_weights=3.0)
-    images = {"pins": torch.randn(2, 3).double(), "handles": torch.randn(1, 3).double()}
+    images = {"pins": torch.randn(2, 3).double(), "handles": torch.randn(3, 3).double()}
     for given in (R, torch.stack([R, 2 * R])):
         expected = solver(given, **images)
         torch.testing.assert_close(solver(given, **images, refinements=2), expected)

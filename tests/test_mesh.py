@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
+from diffpoisson.mesh import require_cells
 from tests import meshes, references
 from tests.meshes import SPATIAL, TOPOLOGIES
 
@@ -520,3 +521,74 @@ def test_a_union_takes_over_what_its_parts_have_computed(make):
     partly = dp.Mesh.concatenate([used[0], dp.Mesh(*make(1))])
     assert "measures" not in partly.__dict__
     assert torch.equal(partly.measures, fresh.measures)
+
+
+@pytest.mark.parametrize("name", SPATIAL)
+def test_vertex_normals_against_libigl(name):
+    mesh = dp.Mesh(*TOPOLOGIES[name]())
+    vertices, faces = mesh.vertices.numpy(), mesh.faces.numpy()
+    normals = igl.per_vertex_normals(vertices, faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_AREA)
+    np.testing.assert_allclose(mesh.vertex_normals, normals, rtol=0, atol=1e-12)
+
+
+def test_vertex_normals_that_cancel_are_zero():
+    """Two faces back to back, with coordinates that do not round."""
+    mesh = dp.Mesh(V[:3], np.array([[0, 1, 2], [0, 2, 1]]))
+    assert torch.equal(mesh.vertex_normals, torch.zeros(3, 3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_arrays_are_copied(kind):
+    """Later edits by the caller must not reach the mesh, nor one that was moved."""
+    vertices, faces = (kind(x.tolist()) for x in meshes.disk())
+    mesh = dp.Mesh(vertices, faces)
+    moved = mesh.with_vertices(positions := mesh.vertices * 2)
+    before = mesh.vertices.clone(), mesh.faces.clone(), moved.vertices.clone()
+    vertices[:], faces[:], positions[:] = 0, 0, 0
+    assert all(map(torch.equal, (mesh.vertices, mesh.faces, moved.vertices), before))
+    assert (mesh.vertex_offsets, mesh.face_offsets) == ((0, len(vertices)), (0, len(faces)))
+
+
+def test_moved_positions_without_area_are_refused():
+    vertices, faces = torch.from_numpy(V), torch.from_numpy(F)
+    require_cells("f", None, faces)
+    require_cells("f", vertices.float(), faces)
+    for value, culprits in ((V[0], [1, 3]), (np.nan, [1, 2, 3])):
+        moved = torch.from_numpy(placed(V, 3, value))
+        with pytest.raises(dp.MeshError, match=re.escape(f"{len(culprits)} faces {culprits}")):
+            require_cells("f", moved, faces)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda m: m.to(3), TypeError, "Mesh.to: expected a dtype or a device, got int"),
+        (lambda m: m.with_vertices(V), TypeError, "Mesh.with_vertices: vertices must be a torch"),
+        (lambda m: dp.Mesh.concatenate([m, 3]), TypeError, "Mesh.concatenate: expected a list of"),
+        (
+            lambda m: dp.Mesh(torch.from_numpy(V), torch.from_numpy(F).to("meta")),
+            dp.MeshError,
+            "Mesh: vertices are on cpu, faces on meta",
+        ),
+        (
+            lambda m: dp.Mesh(torch.from_numpy(V).to_sparse(), F),
+            dp.MeshError,
+            "Mesh: vertices must",
+        ),
+        (lambda m: m.to("meta"), dp.MeshError, "Mesh: vertices must be a dense tensor"),
+        (
+            lambda m: dp.Mesh.cleaned(torch.from_numpy(V).requires_grad_(), F),
+            dp.MeshError,
+            "Mesh: vertices require grad",
+        ),
+    ],
+)
+def test_arguments_of_other_kinds(call, error, message):
+    with pytest.raises(error, match="^" + re.escape(message)):
+        call(dp.Mesh(V, F))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8])
+def test_narrow_indices(dtype):
+    assert dp.Mesh(V, F.astype(dtype)).faces.dtype == torch.int64

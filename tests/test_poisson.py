@@ -274,3 +274,12 @@ def test_a_mesh_of_differentiated_vertices_raises():
     R = field(dp.Mesh(vertices, faces), c=2)
     with pytest.raises(dp.MeshError, match="vertices require grad"):
         grad(lambda v: dp.solve_poisson(dp.Mesh(v, faces), R).sum())(torch.from_numpy(vertices))
+
+
+def test_an_update_keeps_the_gauge_that_fixes_a_vertex():
+    mesh = dp.Mesh(*meshes.parts())
+    R, moved = checks.field(mesh), mesh.vertices * 1.5
+    phi = dp.PoissonSolver(mesh, gauge="vertex").update(moved)(R)
+    expected = dp.PoissonSolver(mesh.with_vertices(moved), gauge="vertex")(R)
+    assert torch.equal(phi, expected)
+    assert (phi[0] == 0).all()

@@ -92,6 +92,7 @@ class PoissonSolver:
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
             self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+            self._require_digits()
 
     def _assign(
         self,
@@ -122,6 +123,35 @@ class PoissonSolver:
     def n_floating(self) -> int:
         """Number of components that hold neither pin nor handle."""
         return self.constraints.n_floating
+
+    def _require_digits(self) -> None:
+        """Raise where rounding leaves nothing of a solution.
+
+        The mesh's own positions have the frames as Jacobians, so they must come back, up to the
+        translation of what floats. At half their size the error leaves no digit, and refinements,
+        which multiply it by itself, are about to diverge.
+        """
+        constraints, X = self.constraints, self._vertices
+        pull = constraints.handle_weights[:, None] * X[constraints.handles]
+        phi = self._fitted(
+            self._frames,
+            X[constraints.pins] if len(constraints.pins) else None,
+            pull if len(constraints.handles) else None,
+        )
+        floats = constraints.floating < constraints.n_floating
+        held = constraints.n_floating + self.mesh.components
+        labels = torch.where(floats, constraints.floating, held)
+        n = constraints.n_floating + self.mesh.n_components
+
+        def centred(x: Tensor) -> Tensor:
+            counts = torch.bincount(labels, minlength=n)[:, None]
+            return x - (x.new_zeros(n, x.shape[1]).index_add(0, labels, x) / counts)[labels]
+
+        error = torch.where(floats[:, None], centred(phi - X), phi - X)
+        squares = torch.stack([error, centred(X)]).square().sum(-1)
+        missed, size = squares.new_zeros(2, n).index_add(1, labels, squares)
+        if not (missed <= size / 4).all():  # or NaN
+            raise MeshError(_no_digits(self.mesh))
 
     def update(self, vertices: Float[Tensor, "n D"]) -> PoissonSolver:
         """The solver of the same faces and constraints at other positions, factorised anew.
@@ -402,13 +432,18 @@ def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
     try:
         return CholeskyFactor(L, mesh.device)
     except ValueError as error:
-        thinness = cells.thinness(mesh._corners)
-        worst = int(thinness.argmin())
-        raise MeshError(
-            "PoissonSolver: in float64 the Laplacian of this mesh is not positive definite; its "
-            f"thinnest face, {worst}, has a height of {float(thinness[worst]):.0e} of its longest "
-            f"edge: remesh such faces, or bring weights closer together ({error})"
-        ) from error
+        raise MeshError(f"{_no_digits(mesh)} ({error})") from error
+
+
+def _no_digits(mesh: Mesh) -> str:
+    thinness = cells.thinness(mesh._corners)
+    worst = int(thinness.argmin())
+    return (
+        "PoissonSolver: in float64 the Laplacian of this mesh is not positive definite, or leaves "
+        f"no digit of a solution; its thinnest face, {worst}, has a height of "
+        f"{float(thinness[worst]):.0e} of its longest edge: remesh such faces, or bring weights "
+        "closer together"
+    )
 
 
 def _require_shape(

@@ -14,6 +14,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
+from diffpoisson import poisson
 from diffpoisson.certificate import is_simple, orientations
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import gradient_operator
@@ -244,19 +245,25 @@ def test_thin_faces_cost_the_square_of_their_aspect(shape, aspect):
     assert (phi - expected).abs().max() < torch.finfo(phi.dtype).eps * condition
 
 
-def test_too_thin_faces_are_named():
-    """Where rounding makes the Laplacian indefinite, as on some of these."""
-    messages = []
-    for shape in (needles, caps):
-        for aspect in (1e8, 1e9, 1e10, 1e11):
-            mesh = dp.Mesh(*shape(aspect))
-            try:
-                dp.PoissonSolver(mesh)
-            except dp.MeshError as error:
-                messages.append((_thinnest(mesh), str(error)))
-    assert messages
-    for thinnest, message in messages:
-        assert f"thinnest face, {thinnest}, has a height of" in message
+@pytest.mark.parametrize("shape", [needles, caps])
+@pytest.mark.parametrize("aspect", [1e8, 1e9, 1e10, 1e11])
+def test_too_thin_faces_raise_and_are_named(shape, aspect):
+    """Also where rounding happens to leave the Laplacian positive definite."""
+    mesh = dp.Mesh(*shape(aspect))
+    with pytest.raises(dp.MeshError, match=f"thinnest face, {_thinnest(mesh)}, has a height of"):
+        dp.PoissonSolver(mesh)
+
+
+def test_a_factor_without_digits_raises(monkeypatch):
+    """The check alone, on a factor of another matrix; with pins and handles too."""
+    mesh = dp.Mesh(*meshes.disk(0))
+    factorised = poisson.CholeskyFactor
+    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(2.5 * L, device))
+    for options in ({}, {"pins": torch.tensor([0, 5])}, {"handles": torch.tensor([3])}):
+        with pytest.raises(dp.MeshError, match="leaves no digit"):
+            dp.PoissonSolver(mesh, **options)
+    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(1.5 * L, device))
+    dp.PoissonSolver(mesh)  # wrong by a third: a digit is left
 
 
 def _thinnest(mesh: dp.Mesh) -> int:

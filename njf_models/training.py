@@ -260,16 +260,12 @@ def make_trainer(
         validate_every: validate after so many steps, not after each pass over the data.
         processes: train data-parallel in so many processes on this machine.
     """
-    checkpoints = ModelCheckpoint(
-        dirpath=folder / "checkpoints",
-        filename="best",
-        monitor="validation/loss",
-        save_last=True,
-        save_on_exception=True,
-        enable_version_counter=False,
-    )
+    where = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
+    best = ModelCheckpoint(filename="best", monitor="validation/loss", **where)
+    # Lightning's own save_last saves only where the monitored value got better.
+    last = ModelCheckpoint(filename="last", save_on_exception=True, **where)
     rate = LearningRateMonitor(logging_interval="epoch")
-    callbacks: list[Callback] = [checkpoints, TQDMProgressBar(), rate]
+    callbacks: list[Callback] = [best, last, TQDMProgressBar(), rate]
     if stop_after is not None:
         callbacks.append(EarlyStopping("validation/loss", patience=stop_after))
     return lightning.Trainer(

@@ -33,6 +33,8 @@ class Fault(NamedTuple):
     def injected(self) -> Iterator[None]:
         with pytest.MonkeyPatch.context() as patch:
             self.inject(patch)
+            # The layer's own check refuses many such solvers before any other check could look.
+            patch.setattr(poisson.PoissonSolver, "_require_digits", lambda solver: None)
             yield
 
 

@@ -377,10 +377,15 @@ def test_an_interrupt_leaves_whole_files_only(tmp_path):
     """Many files, interrupted after the first is there."""
     for i in range(40):
         save(tmp_path / "in" / f"{i:02}.obj", meshes.disk(i, 12))
-    command = [sys.executable, "-m", "njf_models.cli", "uv", "in", "out", "--start", "tutte"]
+    # A shell lets its background jobs ignore interrupts, and so would all their children.
+    program = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from njf_models.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", program, "uv", "in", "out", "--start", "tutte", "--no-cut"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
-        [*command, "--no-cut"], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
     )
     deadline = time.monotonic() + 300
     while not list((tmp_path / "out").glob("*.obj")) and time.monotonic() < deadline:

@@ -260,7 +260,7 @@ def make_trainer(
         validate_every: validate after so many steps, not after each pass over the data.
         processes: train data-parallel in so many processes on this machine.
     """
-    where = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
+    where: dict[str, Any] = {"dirpath": folder / "checkpoints", "enable_version_counter": False}
     best = ModelCheckpoint(filename="best", monitor="validation/loss", **where)
     # Lightning's own save_last saves only where the monitored value got better.
     last = ModelCheckpoint(filename="last", save_on_exception=True, **where)

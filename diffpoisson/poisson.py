@@ -131,7 +131,8 @@ class PoissonSolver:
         translation of what floats. At half their size the error leaves no digit, and refinements,
         which multiply it by itself, are about to diverge.
         """
-        constraints, X = self.constraints, self._vertices
+        constraints, components = self.constraints, self.mesh.components
+        X = _centred(self._vertices, components)  # a far origin costs digits, too
         pull = constraints.handle_weights[:, None] * X[constraints.handles]
         phi = self._fitted(
             self._frames,
@@ -139,17 +140,10 @@ class PoissonSolver:
             pull if len(constraints.handles) else None,
         )
         floats = constraints.floating < constraints.n_floating
-        held = constraints.n_floating + self.mesh.components
-        labels = torch.where(floats, constraints.floating, held)
-        n = constraints.n_floating + self.mesh.n_components
-
-        def centred(x: Tensor) -> Tensor:
-            counts = torch.bincount(labels, minlength=n)[:, None]
-            return x - (x.new_zeros(n, x.shape[1]).index_add(0, labels, x) / counts)[labels]
-
-        error = torch.where(floats[:, None], centred(phi - X), phi - X)
-        squares = torch.stack([error, centred(X)]).square().sum(-1)
-        missed, size = squares.new_zeros(2, n).index_add(1, labels, squares)
+        labels = torch.where(floats, constraints.floating, constraints.n_floating + components)
+        error = torch.where(floats[:, None], _centred(phi - X, labels), phi - X)
+        squares = torch.stack([error, _centred(X, labels)]).square().sum(-1)
+        missed, size = squares.new_zeros(2, int(labels.max()) + 1).index_add(1, labels, squares)
         if not (missed <= size / 4).all():  # or NaN
             raise MeshError(_no_digits(self.mesh))
 
@@ -433,6 +427,13 @@ def _factorised(L: sp.csr_matrix, mesh: Mesh) -> CholeskyFactor:
         return CholeskyFactor(L, mesh.device)
     except ValueError as error:
         raise MeshError(f"{_no_digits(mesh)} ({error})") from error
+
+
+def _centred(x: Float[Tensor, "n D"], labels: Int[Tensor, "n"]) -> Float[Tensor, "n D"]:
+    """Each group of points moved to mean zero."""
+    counts = torch.bincount(labels)
+    sums = x.new_zeros(len(counts), x.shape[1]).index_add(0, labels, x)
+    return x - (sums / counts[:, None])[labels]
 
 
 def _no_digits(mesh: Mesh) -> str:

@@ -169,7 +169,7 @@ class NJFTraining(lightning.LightningModule):
         learning_rate: of Adam, at the start.
         patience: validations without improvement before the rate falls to a tenth (the paper).
         steps: let the rate fall to zero along a cosine over so many steps instead.
-        inputs: the options of `UVExamples` that decide what the network sees, for the record.
+        inputs: fields of `uv_network.Inputs`, what the network sees, for the record.
     """
 
     def __init__(

@@ -66,7 +66,8 @@ def run(options: argparse.Namespace) -> int:
 
     options.out.mkdir(parents=True, exist_ok=True)
     lightning.seed_everything(options.seed, verbose=False)
-    train, validation = (_split(options)[name] for name in ("train", "validation"))
+    parts = _split(options)
+    train, validation = parts["train"], parts["validation"]
     print(f"{len(train)} training and {len(validation)} validation patches")
     kind = {"n_points": options.points, "use_wks": options.wks}
     module = NJFTraining(

@@ -1,0 +1,51 @@
+"""`njf data`, then `njf train`, then a network that maps: the whole path by its commands."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import torch
+
+from njf_models.cli import main
+from njf_models.datasets.store import UVStore
+from njf_models.training import last_checkpoint
+from njf_models.uv_network import UVNetwork
+from tests.njf_models.shapes import bumpy_disk
+
+
+def test_data_and_training_by_their_commands(tmp_path, capsys):
+    store, out = tmp_path / "store", tmp_path / "run"
+    data = ["data", str(store), "--csg", "12", "--patches", "1", "--faces", "150", "300"]
+    assert main([*data, "--energies", "0", "--jobs", "1", "--backend", "sequential"]) == 0
+    said = capsys.readouterr().out
+    patches = UVStore(store)
+    assert f"{len(patches)} patches of {len(patches.sources)} meshes" in said
+    assert f"{patches.counts['kept']} kept" in said
+
+    train = ["train", str(store), str(out), "--batch-size", "2", "--points", "32", "--width", "16"]
+    assert main([*train, "--code-size", "16", "--rounds", "2", "--steps", "4"]) == 0
+    split = json.loads((out / "split.json").read_text())
+    families = [set(split[name]) for name in ("train", "validation", "test")]
+    assert set.union(*families) == set(patches.family)
+    assert sum(map(len, families)) == len(set(patches.family))
+
+    checkpoint = last_checkpoint(out)
+    assert checkpoint is not None
+    assert torch.load(checkpoint, weights_only=False)["global_step"] == 4  # its very end
+    network = UVNetwork.from_checkpoint(checkpoint)
+    assert (network.model.rounds, network.inputs.n_points, network.inputs.n_energies) == (2, 32, 0)
+    mesh = bumpy_disk(0)
+    untrained = UVNetwork(network.arguments, network.inputs).predict(mesh)
+    moved = (network.predict(mesh) - untrained).abs().max()
+    assert 0 < float(moved) < np.inf
+
+
+def test_data_without_sources_is_wrong_usage(tmp_path, capsys):
+    assert main(["data", str(tmp_path / "store")]) == 2
+    assert "pass --meshes FOLDER or --csg N" in capsys.readouterr().err
+
+
+def test_training_without_a_store_says_so(tmp_path, capsys):
+    assert main(["train", str(tmp_path / "none"), str(tmp_path / "run"), "--steps", "1"]) == 1
+    assert "no shard in" in capsys.readouterr().err

@@ -125,8 +125,8 @@ class MeshFolder:
     only by a number, a side, a version or a resolution are one family.
 
     Args:
-        folder: searched recursively. A table `manifest.tsv` in it, if there is one, gives licences
-            by the columns `name` (a file's, without its suffix) and `licence`.
+        folder: searched recursively. A table `manifest.tsv` in it, if there is one, tells where
+            meshes are from: columns `name` (a file's, without its suffix), `licence`, `source`.
         licence: recorded with every other mesh.
 
     Raises:
@@ -143,13 +143,15 @@ class MeshFolder:
         self.failures: dict[str, str] = {}
 
     def __iter__(self) -> Iterator[RawMesh]:
-        licences = _licences(self.folder / "manifest.tsv")
+        manifest = _manifest(self.folder / "manifest.tsv")
         for path in self.paths:
             if (mesh := _read_or_report(path, self.failures)) is not None:
                 inside = path.relative_to(self.folder)
-                licence = licences.get(path.stem, self.licence)
+                known = manifest.get(path.stem, {})
+                licence = known.get("licence", self.licence)
+                origin = f"{known['source']}: {path.name}" if "source" in known else path.name
                 family = f"folder/{inside.with_name(_family(path.stem)).as_posix()}"
-                yield RawMesh(f"folder/{inside.as_posix()}", *mesh, licence, path.name, family)
+                yield RawMesh(f"folder/{inside.as_posix()}", *mesh, licence, origin, family)
 
 
 # Endings of names that near-copies differ by: numbers, sides, versions, resolutions.
@@ -165,11 +167,12 @@ def _family(stem: str) -> str:
     return stem
 
 
-def _licences(table: Path) -> dict[str, str]:
+def _manifest(table: Path) -> dict[str, dict[str, str]]:
+    """Rows of a tab-separated table by their column `name`; none if there is no table."""
     if not table.exists():
         return {}
-    with table.open(newline="") as file:
-        return {row["name"]: row["licence"] for row in csv.DictReader(file, delimiter="\t")}
+    with table.open(newline="", encoding="utf-8") as file:
+        return {row["name"]: row for row in csv.DictReader(file, delimiter="\t")}
 
 
 class Thingi10K:

@@ -26,6 +26,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("commands", nargs="+")
     parser.add_argument("--minutes", type=float, required=True, help="that training took")
+    parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--max-energy", type=float, default=8.0, help="as training had it")
     options = parser.parse_args()
     checkpoint = options.out / "checkpoints" / "best.ckpt"
@@ -50,11 +51,12 @@ def main() -> None:
         "chosen by": "loss on the validation split",
         "optimiser steps": int(torch.load(checkpoint, weights_only=False)["global_step"]),
         "minutes of training": options.minutes,
-        "machine": "one thread of a shared two-core machine",
+        "machine": options.machine,
         "commands": " ; ".join(options.commands),
         "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open are "
         "mapped worse, and mostly start from Tutte's embedding",
         "families": split,
+        "meshes": [[s["name"], s["licence"], s["origin"]] for s in store.sources],
     }
     (WEIGHTS / "uv.json").write_text(json.dumps(card, indent=1) + "\n")
 

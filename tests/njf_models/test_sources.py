@@ -181,3 +181,33 @@ def test_thingi10k_asks_its_package_for_manifolds_and_counts_failures(
     inspect.signature(real.init).bind(**calls["init"])
     inspect.signature(real.dataset).bind(**calls["dataset"])
     inspect.signature(real.load_file).bind("path")
+
+
+def test_a_manifest_tells_where_meshes_are_from(tmp_path):
+    for name in ("goat_1", "goat_2", "boot"):
+        trimesh.Trimesh(*meshes.sphere()).export(tmp_path / f"{name}.ply")
+    rows = ["name\tlicence\tsource", "goat_1\tCC BY 4.0\tgithub someone/meshes"]
+    (tmp_path / "manifest.tsv").write_text("\n".join(rows) + "\n")
+    boot, first, second = MeshFolder(tmp_path, licence="MIT")
+    assert (first.licence, first.origin) == ("CC BY 4.0", "github someone/meshes: goat_1.ply")
+    assert (boot.licence, boot.origin) == ("MIT", "boot.ply")
+    assert first.family == second.family != boot.family
+
+
+@pytest.mark.parametrize(
+    ("stem", "family"),
+    [
+        ("dog_L_6", "dog"),
+        ("link12", "link"),
+        ("koala_low_resolution", "koala"),
+        ("cat-lowres", "cat"),
+        ("wrist_v2", "wrist"),
+        ("bowl", "bowl"),  # ends in l, but not as a side
+        ("hammer", "hammer"),
+        ("7", "7"),  # nothing would be left
+    ],
+)
+def test_names_of_near_copies_are_one_family(tmp_path, stem, family):
+    trimesh.Trimesh(*meshes.sphere()).export(tmp_path / f"{stem}.ply")
+    (mesh,) = MeshFolder(tmp_path)
+    assert mesh.family == f"folder/{family}"

@@ -59,7 +59,7 @@ def official_loss(
 def distortion_loss(
     shape: Shape, prediction: Prediction, epsilon: float = 0.1
 ) -> Float[Tensor, ""]:
-    """Mean over the area of log(E / 4), averaged over the shapes; 0 at isometries.
+    """Mean over the area of log(E / 4), averaged over the shapes; near 0 at isometries.
 
     E is the symmetric Dirichlet energy of the emitted map, regularised so that flips are finite and
     unflipping them lowers it. Its logarithm keeps a few deep flips from drowning everything else.

@@ -25,7 +25,7 @@ from diffpoisson.poisson import PoissonSolver
 from diffpoisson.seams import cut_to_disks
 
 T = TypeVar("T")
-Init = Float[Tensor, "n 2"] | Callable[[Mesh], Tensor]
+Init = Float[Tensor, "n 2"] | Callable[[Mesh], Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,8 @@ def parameterize(
     Args:
         mesh: a surface in space, whose components are topological disks unless `cut`.
         init: a map to start from, in the mesh's units, such as a network's: (n, 2) if the mesh is
-            one disk, or a function that is called with the mesh of each chart and returns its map.
+            one disk, or a function that is called with the mesh of each chart and returns its map,
+            or None to start that one from Tutte's embedding.
         cut: cut the surface where topology or low distortion ask for it, see `cut_to_disks`.
         injective: keep charts from overlapping themselves, see `slim`. If false, SLIM's minimum is
             returned, whose distortion is a little lower and which may not be certified.
@@ -221,7 +222,11 @@ def _starts(
     if init is None:
         return [None] * len(parts)
     if callable(init):
-        return [_checked(part.mesh, init(part.mesh)) for part in parts]
+        made = [init(part.mesh) for part in parts]
+        return [
+            None if uv is None else _checked(part.mesh, uv)
+            for part, uv in zip(parts, made, strict=True)
+        ]
     if not mesh.is_disk:
         raise ValueError(
             "parameterize: init belongs to a mesh that is one disk; for other meshes pass a "

@@ -43,8 +43,10 @@ def card(name: str = "uv") -> dict[str, Any]:
 def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any) -> dp.UVMap:
     """A flip-free UV map of a surface, from a network's prediction for each chart.
 
-    `diffpoisson.parameterize(mesh, network.predict, ...)`: the prediction is repaired where it
-    flips triangles, polished by SLIM, and replaced by Tutte's embedding where nothing mends it.
+    `diffpoisson.parameterize(mesh, network.start, ...)`: the prediction is repaired where it flips
+    triangles, polished by SLIM, and replaced by Tutte's embedding where nothing mends it. Charts
+    that are whole closed surfaces, cut open, have no mean normal and so no pose for the network to
+    see them in: they start from Tutte's embedding.
 
     Args:
         mesh: a surface in space, whose components are topological disks unless `cut`.
@@ -55,7 +57,7 @@ def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any
         MeshError: see there.
     """
     network = load_pretrained(model) if isinstance(model, str) else model
-    return dp.parameterize(mesh, network.predict, **options)
+    return dp.parameterize(mesh, network.start, **options)
 
 
 def _file(name: str, suffix: str) -> Path:

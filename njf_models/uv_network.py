@@ -18,7 +18,7 @@ from torch import Tensor
 import diffpoisson as dp
 from diffpoisson.mesh import require_mesh
 from diffpoisson.parameterization import describe_topology
-from njf_models.datasets.patches import PatchRejectedError, align
+from njf_models.datasets.patches import PatchRejectedError, align, has_pose
 from njf_models.features import Shape, point_features
 from njf_models.njf import NeuralJacobianField
 
@@ -83,6 +83,11 @@ class UVNetwork:
             MeshError: not a disk in space, or its area vectors cancel, so that it has no pose.
         """
         return self.predict_all([mesh])[0]
+
+    def start(self, mesh: dp.Mesh) -> Float[Tensor, "n 2"] | None:
+        """What `diffpoisson.parameterize` calls for each chart: the map, or None without a pose."""
+        has_one = has_pose(mesh.vertices.double().cpu().numpy(), mesh.faces.cpu().numpy())
+        return self.predict(mesh) if has_one else None
 
     def predict_all(self, meshes: Sequence[dp.Mesh]) -> list[Float[Tensor, "n 2"]]:
         """The maps of several disks, in one pass of the network; see `predict`."""
@@ -169,6 +174,7 @@ def _aligned(mesh: dp.Mesh) -> dp.Mesh:
         aligned, _ = align(vertices, faces)
     except PatchRejectedError as error:
         raise dp.MeshError(
-            "UVNetwork: the area vectors of this mesh cancel, so it has no pose; cut it"
+            "UVNetwork: the area vectors of this mesh cancel, as those of a closed surface do that "
+            "was cut open, so it has no pose; njf_models.parameterize starts from Tutte's map then"
         ) from error
     return dp.Mesh(aligned, mesh.faces.cpu())

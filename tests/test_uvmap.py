@@ -239,3 +239,18 @@ def test_what_rounding_flips_raises():
     with pytest.raises(dp.MeshError, match=r"rounding the map to torch.float32 .*float64"):
         dp.parameterize(mesh)
     assert_valid(mesh.to(torch.float64), dp.parameterize(mesh.to(torch.float64)))
+
+
+def test_a_function_starts_the_charts_that_it_can():
+    """It sees each chart's own mesh; where it returns None, Tutte's embedding is the start."""
+    parts = [dp.Mesh(*meshes.disk(seed, size)) for seed, size in ((0, 5), (1, 6))]
+    seen = []
+
+    def start(mesh: dp.Mesh) -> torch.Tensor | None:
+        seen.append(mesh.n_vertices)
+        return dp.tutte(mesh) if mesh.n_vertices == parts[1].n_vertices else None
+
+    uvmap = dp.parameterize(dp.Mesh.concatenate(parts), start, tolerance=1e-3)
+    assert seen == [part.n_vertices for part in parts]
+    assert [chart.method.split("+")[0] for chart in uvmap.charts] == ["tutte", "init"]
+    assert uvmap.certified

@@ -194,6 +194,17 @@ def rounded_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
         raise PatchRejectedError("rounding") from None
 
 
+def has_pose(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether the area vectors leave a mean normal.
+
+    Those of a closed surface cancel, also if it was cut open, but for the rounding of m terms.
+    """
+    area_vectors = _area_vectors(vertices, faces)
+    total = np.linalg.norm(area_vectors, axis=1).sum()
+    rounding = len(faces) * np.finfo(np.float64).eps * total
+    return bool(np.linalg.norm(area_vectors.sum(axis=0)) > rounding)
+
+
 def align(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, float]:
     """Vertices in the canonical pose, which no rotation, translation or scaling of them changes.
 
@@ -205,14 +216,14 @@ def align(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, float]:
         (n, 3) aligned vertices, and the flatness |Σ nA| / ΣA.
 
     Raises:
-        PatchRejectedError: the mean normal vanishes, so there is no canonical direction.
+        PatchRejectedError: there is no such pose, see `has_pose`.
     """
     corners = vertices[faces]
     area_vectors = _area_vectors(vertices, faces)
     areas = np.linalg.norm(area_vectors, axis=1)
     mean_normal = area_vectors.sum(axis=0)
     flatness = np.linalg.norm(mean_normal) / areas.sum()
-    if flatness == 0:
+    if not has_pose(vertices, faces):
         raise PatchRejectedError("no mean normal")
     weights = areas / areas.sum()
     centroids = corners.mean(axis=1)

@@ -53,8 +53,8 @@ def main() -> None:
         "minutes of training": options.minutes,
         "machine": options.machine,
         "commands": " ; ".join(options.commands),
-        "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open are "
-        "mapped worse, and mostly start from Tutte's embedding",
+        "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open have no "
+        "pose to be seen in, and start from Tutte's embedding",
         "families": split,
         "meshes": [[s["name"], s["licence"], s["origin"]] for s in store.sources],
     }

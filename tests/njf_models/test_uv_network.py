@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 from safetensors.torch import save_file
 from torch.testing import assert_close
 
@@ -107,3 +108,22 @@ def test_parameterize_from_a_network_certifies(network, make):
     assert uvmap.flipped == 0
     triangles = uvmap.uv[uvmap.mesh.faces]
     assert (torch.linalg.det(triangles[:, 1:] - triangles[:, :1]) > 0).all()
+
+
+def cube() -> dp.Mesh:
+    """Closed, and so symmetric that its area vectors cancel exactly."""
+    box = trimesh.creation.box().subdivide().subdivide()
+    return dp.Mesh.cleaned(np.array(box.vertices), np.array(box.faces)).mesh
+
+
+@pytest.mark.parametrize("closed", [cube(), dp.Mesh(*meshes.sphere(0)), dp.Mesh(*meshes.torus(0))])
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_closed_surfaces_cut_open_start_from_tutte(network, closed, scale):
+    """They have no pose; where rounding leaves something of a mean normal, that is none either."""
+    mesh = dp.Mesh(scale * (closed.vertices + 0.1), closed.faces)
+    uvmap = parameterize(mesh, model=network, cut=True, tolerance=1e-3)
+    assert uvmap.certified
+    assert uvmap.method.startswith("tutte")
+    with pytest.raises(dp.MeshError, match="no pose"):
+        network.predict(uvmap.mesh)
+    assert network.start(bumpy_disk(0)) is not None

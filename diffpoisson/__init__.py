@@ -6,6 +6,7 @@ from diffpoisson.certificate import Certificate, certify
 from diffpoisson.distortion import (
     arap,
     area_distortion,
+    closest_rotation,
     determinant,
     flipped,
     isometric_amips,
@@ -45,6 +46,7 @@ __all__ = [
     "certify",
     "clamp_flips",
     "clamp_singular_values",
+    "closest_rotation",
     "determinant",
     "divergence",
     "extend",

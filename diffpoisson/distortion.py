@@ -49,6 +49,24 @@ def singular_values(J: Jacobian) -> Float[Tensor, "*batch d"]:
     return torch.stack([total + difference, total - difference], dim=-1) / 2
 
 
+def closest_rotation(J: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
+    """The rotation Q that minimises ‖J - Q‖: the local step of Liu et al. 2008, in the plane.
+
+    That of the similarity part of J. Where it vanishes, as it does for a reflection, all rotations
+    are equally close: Q is then the identity, with derivative zero.
+
+    Raises:
+        ValueError: J is not (…, 2, 2).
+    """
+    if _shape(J) != (2, 2):
+        raise ValueError(f"closest_rotation: expected J of shape (…, 2, 2), got {tuple(J.shape)}")
+    similarity, _ = similarity_parts(J)
+    length = torch.linalg.vector_norm(similarity, dim=-1, keepdim=True)
+    unit = similarity / torch.where(length > 0, length, 1)
+    p, q = torch.where(length > 0, unit, unit.new_tensor([1, 0])).unbind(-1)
+    return torch.stack([p, -q, q, p], dim=-1).unflatten(-1, (2, 2))
+
+
 def determinant(J: Jacobian) -> Density:
     """det J, the ratio of measures: signed if J is square, positive for surfaces in space."""
     shape = _shape(J)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -39,6 +40,27 @@ def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#ba
     difference = prediction.jacobians - dp.jacobians(shape.mesh, target)
     jacobians = shape.face_weights.to(difference.dtype) * difference.square().sum((-2, -1))
     return _sum(vertices.sum(-1).mean() / n_parts, jacobians.sum(-1).mean() / n_parts)
+
+
+def turned_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#batch n 2"]) -> Loss:
+    """`paper_loss` after each target has been turned about its centre onto the map.
+
+    For maps whose energy does not see rotations, as UV maps' does not: where a patch is bent so far
+    that its projection says little, the target's rotation is arbitrary and can't be learned.
+
+    Args:
+        shape: the source(s).
+        prediction: what the network made of them, maps to the plane.
+        target: (…, n, 2) Ψ, the images of the vertices, in any position.
+    """
+    with torch.no_grad():
+        part, phi = shape.mesh.part_of_vertex, prediction.vertices
+        weighted = shape.vertex_weights.to(phi.dtype)[:, None] * centre_areas(shape, target)
+        covariance = phi[..., :, None] * weighted[..., None, :]
+        sums = covariance.new_zeros(*covariance.shape[:-3], shape.mesh.n_parts, 2, 2)
+        turns = dp.closest_rotation(sums.index_add(-3, part, covariance))
+        turned = (turns[..., part, :, :] @ target[..., None].to(phi.dtype))[..., 0]
+    return paper_loss(shape, prediction, turned)
 
 
 def official_loss(
@@ -78,4 +100,4 @@ def _sum(vertices: Tensor, jacobians: Tensor) -> Loss:
     return Loss(VERTEX_WEIGHT * vertices + jacobians, vertices, jacobians)
 
 
-LOSSES = {"paper": paper_loss, "official": official_loss}
+LOSSES = {"paper": paper_loss, "turned": turned_loss, "official": official_loss}

@@ -50,6 +50,8 @@ class NeuralJacobianField(nn.Module):
         output_dim: c, 3 for maps to space, 2 for maps to the plane.
         rounds: number of predictions, each followed by a solve; 1 is the paper's network.
         shared_rounds: whether all corrections have one network, or each its own.
+        local_step: what a correction adds to: rotations closest to the Jacobians of the solved map,
+            as in local/global methods, or these Jacobians themselves. For maps to the plane.
         centering: whether the emitted map has area-weighted mean zero on each component (the
             paper), or its plain mean over vertices is zero (the authors' experiments).
         width: size of the field's hidden layers.
@@ -68,20 +70,23 @@ class NeuralJacobianField(nn.Module):
         shared_rounds: bool = False,
         centering: Centering = "area",
         width: int = 128,
+        local_step: bool = False,
     ) -> None:
         super().__init__()
         if centering not in ("area", "vertex"):
             raise ValueError(f"centering must be 'area' or 'vertex', got {centering!r}")
         require_integer("NeuralJacobianField", "rounds", rounds, least=1)
+        if local_step and output_dim != 2:
+            raise ValueError(f"local_step is for maps to the plane, got output_dim={output_dim}")
         self.encodes_target, self.output_dim, self.centering = encodes_target, output_dim, centering
-        self.rounds, self.shared_rounds = rounds, shared_rounds
+        self.rounds, self.shared_rounds, self.local_step = rounds, shared_rounds, local_step
         self.encoder = PointNet(point_features, code_size) if point_features else None
         n_codes = (1 + encodes_target) if point_features else 0
         code_size = n_codes * code_size + parameters
         entries = output_dim * 3
         self.field = FieldMLP(code_size, face_features, entries, width)
         self.corrections = nn.ModuleList(
-            FieldMLP(code_size, face_features + 2 * entries, entries, width)
+            FieldMLP(code_size, face_features + (2 + local_step) * entries, entries, width)
             for _ in range(min(rounds - 1, 1) if shared_rounds else rounds - 1)
         )
 
@@ -137,9 +142,9 @@ class NeuralJacobianField(nn.Module):
         predictions = [self._solved(shape, identity + self._matrices(offsets))]
         for k in range(self.rounds - 1):
             correction = self.corrections[0 if self.shared_rounds else k]
-            J, seen = self._read_back(shape, predictions[-1])
+            base, seen = self._read_back(shape, predictions[-1])
             offsets = correction(seen, code, part_of_face)
-            predictions.append(self._solved(shape, J + self._matrices(offsets)))
+            predictions.append(self._solved(shape, base + self._matrices(offsets)))
         return predictions
 
     def _matrices(self, outputs: Float[Tensor, "*any entries"]) -> Float[Tensor, "*any c 3"]:
@@ -152,15 +157,18 @@ class NeuralJacobianField(nn.Module):
     def _read_back(
         self, shape: Shape, prediction: Prediction
     ) -> tuple[Float[Tensor, "*batch m c 3"], Float[Tensor, "*batch m f"]]:
-        """Jacobians of the solved map, and what a correction sees: also what they miss of R.
+        """What a correction adds to, and what it sees: J, how far it misses R, closest rotations.
 
-        On ambient vectors, where they do not depend on the frames.
+        On ambient vectors, where nothing depends on the frames.
         """
         J = dp.jacobians(shape.mesh, prediction.vertices)
-        missed = dp.extend(prediction.jacobians - J, shape.frames)
-        J = dp.extend(J, shape.frames)
+        seen = [J, prediction.jacobians - J]
+        if self.local_step:
+            seen.append(dp.closest_rotation(J))
+        seen = [dp.extend(matrices, shape.frames) for matrices in seen]
         features = shape.features.expand(*J.shape[:-2], -1)
-        return J, torch.cat([features, J.flatten(-2), missed.flatten(-2)], dim=-1)
+        base = seen[-1] if self.local_step else seen[0]
+        return base, torch.cat([features, *(matrices.flatten(-2) for matrices in seen)], dim=-1)
 
     def _centred(
         self, shape: Shape, phi: Float[Tensor, "*batch n c"]

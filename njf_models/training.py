@@ -128,7 +128,7 @@ class Objective:
     """What training minimises: supervised loss + distortion · distortion loss.
 
     Attributes:
-        supervised: "paper" or "official" (see `losses`), or None for training without targets.
+        supervised: one of `losses.LOSSES`, or None for training without targets.
         distortion: weight of `losses.distortion_loss`, for maps to the plane.
         epsilon: its regularisation.
         augment: whether each batch is turned, mirrored and scaled at random.

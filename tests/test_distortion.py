@@ -214,6 +214,37 @@ def test_arap_is_the_distance_to_the_nearest_rotation():
             assert (((J - Q) ** 2).sum((1, 2)) >= dp.arap(J) - 1e-12).all()
 
 
+def test_closest_rotation_is_the_polar_factor():
+    J = random_jacobians(2).reshape(4, 10, 2, 2)
+    U, _, Vt = np.linalg.svd(J.numpy())
+    U[..., 1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    Q = dp.closest_rotation(J)
+    assert_near(Q, U @ Vt, 1e-13)
+    assert_near(dp.closest_rotation(1e-150 * J), Q, 1e-13)
+    assert_near(dp.closest_rotation(1e150 * J), Q, 1e-13)
+    assert torch.autograd.gradcheck(dp.closest_rotation, J[0].requires_grad_())
+
+
+@given(jacobians(), angles)
+def test_no_rotation_is_closer(drawn, angle):
+    J = drawn[0]
+    distance = torch.linalg.vector_norm(J - dp.closest_rotation(J))
+    assert distance <= torch.linalg.vector_norm(J - rotation(angle)) * (1 + 1e-12)
+
+
+def test_where_all_rotations_are_equally_close_the_identity_is_taken():
+    J = torch.tensor([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 0.0], [0.0, 0.0]]], requires_grad=True)
+    Q = dp.closest_rotation(J)
+    assert_near(Q, torch.eye(2).expand(2, 2, 2), 0)
+    (derivative,) = torch.autograd.grad(Q.square().sum() + Q.sum(), J)
+    assert_near(derivative, torch.zeros(2, 2, 2), 0)
+
+
+def test_closest_rotation_is_of_the_plane(unchecked):
+    with pytest.raises(ValueError, match=r"closest_rotation: expected J of shape \(…, 2, 2\)"):
+        dp.closest_rotation(random_jacobians(3))
+
+
 def test_lscm_is_the_cauchy_riemann_residual():
     J = random_jacobians(2)
     ux, uy, vx, vy = J.flatten(1).unbind(1)

@@ -37,6 +37,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--meshes", type=Path, nargs="+", default=[], metavar="FOLDER", help="obj, ply, off, stl")
     add("--licence", default="unknown", help="of the meshes in the folders, recorded with them")
     add("--csg", type=int, default=0, metavar="N", help="number of generated parts (0)")
+    add("--bent", type=int, default=0, metavar="N", help="bent copies of each mesh (0)")
     add("--patches", type=int, default=100, metavar="N", help="patches per mesh (100)")
     add("--faces", type=int, nargs=2, default=(500, 2000), help="size of a patch (500 2000)")
     add(
@@ -82,12 +83,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _sources(options: argparse.Namespace) -> Iterator[RawMesh]:
-    from njf_models.datasets.sources import CSGParts, MeshFolder  # noqa: PLC0415
+    from njf_models.datasets.sources import Bent, CSGParts, MeshFolder  # noqa: PLC0415
 
     folders = [MeshFolder(folder, options.licence) for folder in options.meshes]
     if not folders and not options.csg:
         raise UsageError("no meshes: pass --meshes FOLDER or --csg N")
-    return chain(*folders, CSGParts(options.csg, options.seed))
+    meshes = chain(*folders, CSGParts(options.csg, options.seed))
+    return iter(Bent(meshes, options.bent, options.seed))
 
 
 def _connect(options: argparse.Namespace) -> None:

@@ -38,11 +38,17 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--rate", type=float, default=1e-3, help="learning rate at the start (1e-3)")
     add("--rounds", type=int, default=2, metavar="N", help="predictions and solves (2; paper 1)")
     add("--shared-rounds", action="store_true", help="one network for all corrections")
+    add("--local-step", action="store_true", help="corrections start from closest rotations")
     add("--width", type=int, default=128, metavar="N", help="of hidden layers (128)")
     add("--code-size", type=int, default=256, metavar="N", help="of PointNet's code (256)")
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256; paper 1024)")
     add("--wks", action="store_true", help="use the store's wave-kernel signatures")
-    add("--loss", choices=("paper", "none"), default="paper", help="distance to targets (paper)")
+    add(
+        "--loss",
+        choices=("paper", "turned", "none"),
+        default="paper",
+        help="distance to targets; turned: after turning them onto the map (paper)",
+    )
     add("--distortion", type=float, default=0.3, help="weight of the distortion loss (0.3)")
     add("--no-augment", dest="augment", action="store_false", help="no random turns and scales")
     add("--min-flatness", type=float, default=0.0, help="leave out patches below |Σ nA| / ΣA (0)")
@@ -107,6 +113,7 @@ def _model(options: argparse.Namespace, n_energies: int) -> dict[str, Any]:
         "rounds": options.rounds,
         "shared_rounds": options.shared_rounds,
         "width": options.width,
+        "local_step": options.local_step,
     }
 
 

@@ -1,4 +1,4 @@
-"""Where meshes come from: bone scans, procedural CSG parts, a folder, Thingi10K.
+"""Where meshes come from: bone scans, procedural CSG parts, a folder, Thingi10K, bent copies.
 
 Every source is an iterable of `RawMesh`, read lazily; those that read files collect what they
 could not read in `failures` instead of stopping.
@@ -11,14 +11,15 @@ import importlib.util
 import math
 import re
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from diffpoisson.mesh import Mesh
+from njf_models.datasets.fingerprint import fingerprint
 from njf_models.meshfiles import read_mesh_file
 
 _MESH_SUFFIXES = {".obj", ".off", ".ply", ".stl"}
@@ -219,6 +220,54 @@ class Thingi10K:
             origin = f"https://www.thingiverse.com/thing:{entry['thing_id']} by {entry['author']}"
             family = f"thingi10k/thing/{entry['thing_id']}"
             yield RawMesh(name, *mesh, entry["license"], origin, family)
+
+
+class Bent:
+    """Each mesh of a source, then copies of it under smooth random maps of space.
+
+    A map is x ↦ D x + Σₖ aₖ sin(ωₖ · x + φₖ) in coordinates where the mesh has unit radius. The
+    diagonal D stretches each axis by between 2/3 and 3/2, and ‖aₖ‖ ‖ωₖ‖ = 1/5 for each of four
+    waves, whose directions are random: space folds only where all align, and seldom then.
+    Connectivity stays; a copy belongs to the family of its original.
+
+    Args:
+        source: any meshes.
+        copies: of each.
+        seed: copy i of a mesh depends on (seed, i) and the name of the mesh only.
+    """
+
+    def __init__(self, source: Iterable[RawMesh], copies: int, seed: int = 0) -> None:
+        self.source, self.copies, self.seed = source, copies, seed
+
+    def __iter__(self) -> Iterator[RawMesh]:
+        for raw in self.source:
+            yield raw
+            for i in range(self.copies):
+                rng = np.random.default_rng([self.seed, i, int(fingerprint(raw.name), 16)])
+                yield replace(
+                    raw,
+                    name=f"{raw.name}~{self.seed}.{i}",
+                    vertices=_bent(raw.vertices, rng),
+                    origin=f"{raw.origin}, bent (seed {self.seed}, copy {i})",
+                )
+
+
+def _bent(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A smooth random map of space, see `Bent`."""
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    radius = np.linalg.norm(vertices - middle, axis=1).max()
+    x = (vertices - middle) / radius
+    stretched = x * 1.5 ** rng.uniform(-1, 1, 3)
+    directions = _unit(rng.normal(size=(4, 3)))
+    frequencies = rng.uniform(1.0, 6.0, 4)
+    phases = np.sin(x @ (frequencies[:, None] * directions).T + rng.uniform(0, 2 * np.pi, 4))
+    return middle + radius * (
+        stretched + phases @ (_unit(rng.normal(size=(4, 3))) / 5 / frequencies[:, None])
+    )
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 # -------------------------------------------------------------------- files

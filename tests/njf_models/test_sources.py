@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import importlib.machinery
 import importlib.util
 import inspect
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from njf_models.datasets.sources import CSGParts, DogBones, MeshFolder, RawMesh, Thingi10K
+from njf_models.datasets.sources import Bent, CSGParts, DogBones, MeshFolder, RawMesh, Thingi10K
 from tests import meshes
 
 needs_dm_control = pytest.mark.skipif(
@@ -28,6 +29,47 @@ def assert_closed_manifold(raw: RawMesh) -> None:
     assert igl.is_vertex_manifold(faces).all()
     assert len(igl.boundary_facets(faces)[0]) == 0
     assert (igl.doublearea(raw.vertices, faces) > 0).all()
+
+
+# ------------------------------------------------------- bent copies
+
+
+def lengths(raw: RawMesh) -> np.ndarray:
+    a, b = raw.vertices[raw.faces[:, 0]], raw.vertices[raw.faces[:, 1]]
+    return np.linalg.norm(a - b, axis=1)
+
+
+def test_bent_copies_follow_their_original_and_belong_to_its_family() -> None:
+    parts = list(CSGParts(2, n_faces=500))
+    bent = list(Bent(parts, 3, seed=4))
+    assert [raw.name for raw in bent[:4]] == [
+        "csg/0/0000",
+        *(f"csg/0/0000~4.{i}" for i in range(3)),
+    ]
+    assert bent[0] is parts[0]
+    assert bent[4] is parts[1]
+    assert {raw.family for raw in bent[:4]} == {"csg/0/0000"}
+    assert bent[2].origin == f"{parts[0].origin}, bent (seed 4, copy 1)"
+    for raw in bent:
+        assert_closed_manifold(raw)
+    # Bending stretches by amounts that differ over the surface, not by one affine map.
+    stretch = lengths(bent[1]) / lengths(parts[0])
+    assert 0.3 < stretch.min() < stretch.max() < 2.5
+    affine = np.column_stack([parts[0].vertices, np.ones(len(parts[0].vertices))])
+    fitted = affine @ np.linalg.lstsq(affine, bent[1].vertices)[0]
+    assert np.abs(fitted - bent[1].vertices).max() > 0.02 * np.ptp(bent[1].vertices)
+
+
+def test_a_bent_copy_depends_on_the_mesh_and_its_number_only() -> None:
+    first, second = list(CSGParts(2, n_faces=500))
+    alone = list(Bent([second], 2))[2]
+    (again,) = (raw for raw in Bent([first, second], 3) if raw.name == alone.name)
+    np.testing.assert_array_equal(alone.vertices, again.vertices)
+    moved = dataclasses.replace(second, vertices=1000 * second.vertices + 7)
+    np.testing.assert_allclose(
+        list(Bent([moved], 2))[2].vertices, 1000 * alone.vertices + 7, rtol=1e-9
+    )
+    assert len({tuple(raw.vertices[0]) for raw in Bent([first], 5)}) == 6
 
 
 # ------------------------------------------------------- bones

@@ -16,10 +16,23 @@ from tests.njf_models.shapes import bumpy_disk
 
 def test_data_and_training_by_their_commands(tmp_path, capsys):
     store, out = tmp_path / "store", tmp_path / "run"
-    data = ["data", str(store), "--csg", "12", "--patches", "1", "--faces", "150", "300"]
+    data = [
+        "data",
+        str(store),
+        "--csg",
+        "12",
+        "--bent",
+        "1",
+        "--patches",
+        "1",
+        "--faces",
+        "150",
+        "300",
+    ]
     assert main([*data, "--energies", "0", "--jobs", "1", "--backend", "sequential"]) == 0
     said = capsys.readouterr().out
     patches = UVStore(store)
+    assert any("~" in name for name in patches.mesh_name)
     assert f"{len(patches)} patches of {len(patches.sources)} meshes" in said
     assert f"{patches.counts['kept']} kept" in said
 

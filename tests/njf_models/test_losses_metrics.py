@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 import diffpoisson as dp
 from njf_models import Prediction, Shape
-from njf_models.losses import official_loss, paper_loss
+from njf_models.losses import official_loss, paper_loss, turned_loss
 from njf_models.metrics import (
     count_distorted,
     count_flips,
@@ -87,6 +87,60 @@ def test_paper_loss_of_a_batch_is_the_mean_of_its_shapes():
     )
     total = paper_loss(Shape.concatenate(shapes), union, target).total
     assert_close(float(total), expected, rtol=1e-10, atol=0)
+
+
+def test_turned_loss_of_a_batch_turns_each_target_as_the_svd_does():
+    shapes = [prepared(bumpy_disk(0)), prepared(ellipsoid()), prepared(bumpy_disk(2, 4))]
+    single = [made_up(shape, 2, i) for i, shape in enumerate(shapes)]
+    expected = []
+    for shape, (prediction, target) in zip(shapes, single, strict=True):
+        weights = shape.vertex_weights.numpy()[:, None]
+        phi, psi = prediction.vertices.numpy(), target.numpy()
+        U, _, Vt = np.linalg.svd((weights * phi).T @ (psi - (weights * psi).sum(0)))
+        U[:, 1] *= np.sign(np.linalg.det(U @ Vt))  # a rotation, no reflection
+        turned = torch.from_numpy(psi @ (U @ Vt).T)
+        expected.append(float(paper_loss(shape, prediction, turned).total))
+        assert expected[-1] < float(paper_loss(shape, prediction, target).total)
+    union = Prediction(*(torch.cat(fields) for fields in zip(*(p for p, _ in single), strict=True)))
+    target = torch.cat([t for _, t in single])
+    total = turned_loss(Shape.concatenate(shapes), union, target).total
+    assert_close(float(total), np.mean(expected), rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize("angle", [0.3, 3.0])
+def test_turned_loss_is_blind_to_rotations_but_not_to_reflections(angle):
+    shape = prepared(bumpy_disk())
+    mesh = shape.mesh
+    target = mesh.vertices[:, :2]
+    c, s = np.cos(angle), np.sin(angle)
+    turn = torch.tensor([[c, -s], [s, c]])
+    for image, least in ((turn, 0), (turn @ torch.diag(torch.tensor([1.0, -1.0]).double()), 1e-2)):
+        moved = target @ image.T + 5
+        J = dp.jacobians(mesh, moved)
+        phi = moved - (shape.vertex_weights[:, None] * moved).sum(0)
+        loss = float(turned_loss(shape, Prediction(dp.extend(J, shape.frames), J, phi), target)[0])
+        assert least <= loss and (least or loss < 1e-20)
+
+
+def test_the_gradient_of_turned_loss_in_vertices_is_that_of_the_minimum_over_turns():
+    """By the envelope theorem, although the turn itself is held constant."""
+    shape = prepared(bumpy_disk())
+    prediction, target = made_up(shape, 2, 3)
+
+    def minimum(phi):
+        angles = torch.linspace(0, 2 * np.pi, 100_001, dtype=torch.float64)
+        psi = target - (shape.vertex_weights[:, None] * target).sum(0)
+        a = (shape.vertex_weights[:, None] * phi).T @ psi
+        gain = (a[0, 0] + a[1, 1]) * angles.cos() + (a[1, 0] - a[0, 1]) * angles.sin()
+        size = (shape.vertex_weights[:, None] * (phi.square() + psi.square())).sum()
+        return size - 2 * gain.max()
+
+    phi = prediction.vertices.clone().requires_grad_()
+    loss = turned_loss(shape, prediction._replace(vertices=phi), target).vertices
+    (ours,) = torch.autograd.grad(loss, phi)
+    (theirs,) = torch.autograd.grad(minimum(phi), phi)
+    assert_close(loss, minimum(phi), rtol=1e-8, atol=0)
+    assert_close(ours, theirs, rtol=1e-3, atol=1e-6)
 
 
 def test_paper_loss_does_not_depend_on_unit_or_refinement():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
 from typing import Any
 
 import cholespy
@@ -109,21 +108,3 @@ class _Handle:
             nothing = np.empty((self._n, 0))
             self._solver.solve(nothing, np.empty_like(nothing))
         self._solver = None
-
-
-class BlockDiagonal(Matrix):
-    """A block-diagonal matrix, multiplied block by block: factors of several meshes as one."""
-
-    def __init__(self, blocks: Sequence[Matrix]) -> None:
-        self._blocks = blocks
-        self._columns = [block.shape[1] for block in blocks]
-        self.shape = (sum(block.shape[0] for block in blocks), sum(self._columns))
-
-    def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
-        """A x."""
-        pieces = x.split(self._columns)
-        return torch.cat([A.multiply(piece) for A, piece in zip(self._blocks, pieces, strict=True)])
-
-    def transposed(self) -> BlockDiagonal:
-        """Aᵀ."""
-        return BlockDiagonal([block.transposed() for block in self._blocks])

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -21,7 +23,7 @@ from torch import Tensor
 from diffpoisson import cells
 from diffpoisson.arguments import require_single_or_double, require_tensor
 from diffpoisson.intrinsic import intrinsic_delaunay_laplacian
-from diffpoisson.linear_map import LinearMap, Matrix
+from diffpoisson.linear_map import BlockDiagonal, LinearMap, Matrix
 from diffpoisson.mesh import Mesh, require_cells, require_mesh
 from diffpoisson.restriction import extend, restrict
 from diffpoisson.transforms import concrete, constant_property, outside_transforms
@@ -32,7 +34,7 @@ class SparseMatrix(Matrix):
 
     def __init__(self, matrix: sp.csr_matrix, device: torch.device) -> None:
         self.shape = matrix.shape
-        self._scipy = matrix
+        self.scipy = matrix
         self._device = device
         self._by_dtype: dict[torch.dtype, Tensor] = {}
 
@@ -44,10 +46,14 @@ class SparseMatrix(Matrix):
 
     def transposed(self) -> SparseMatrix:
         """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""
-        return SparseMatrix(self._scipy.T.tocsr(), self._device)
+        return self._transposed
+
+    @cached_property
+    def _transposed(self) -> SparseMatrix:
+        return SparseMatrix(self.scipy.T.tocsr(), self._device)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SparseMatrix, (self._scipy, self._device)
+        return SparseMatrix, (self.scipy, self._device)
 
     def _in(self, dtype: torch.dtype) -> Tensor:
         if dtype not in (torch.float32, torch.float64):
@@ -55,7 +61,7 @@ class SparseMatrix(Matrix):
                 f"mesh operators work in float32 and float64, got {dtype}; convert first"
             )
         if dtype not in self._by_dtype:
-            self._by_dtype[dtype] = _to_torch(self._scipy, dtype, self._device)
+            self._by_dtype[dtype] = _to_torch(self.scipy, dtype, self._device)
         return self._by_dtype[dtype]
 
 
@@ -76,21 +82,32 @@ def _to_torch(matrix: sp.csr_matrix, dtype: torch.dtype, device: torch.device) -
         )
 
 
+def _to_scipy(matrix: Matrix) -> sp.csr_matrix:
+    if isinstance(matrix, BlockDiagonal):
+        return sp.block_diag([_to_scipy(block) for block in matrix.blocks], format="csr")
+    assert isinstance(matrix, SparseMatrix)
+    return matrix.scipy
+
+
 class GradientOperator:
     """∇ of one mesh and what is made of it, assembled once; see `gradient_operator`.
 
     Attributes:
-        matrix: ∇ as a SciPy matrix (m·d, n), float64; row d·j + i is direction i on face j.
         gradient: ∇ as a differentiable map, (n, ·) to (m·d, ·).
         adjoint: ∇ᵀ as a differentiable map, (m·d, ·) to (n, ·).
         weights: (m·d, 1) float64 measure of the cell of each row: the diagonal of A.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
-        self.matrix = _gradient_matrix(mesh)
-        self.gradient = LinearMap(SparseMatrix(self.matrix, mesh.device))
+    def __init__(self, mesh: Mesh, gradient: SparseMatrix | BlockDiagonal) -> None:
+        self._gradient = gradient
+        self.gradient = LinearMap(gradient)
         self.adjoint = self.gradient.T
         self.weights = mesh._double_measures.repeat_interleave(mesh.cell_dim)[:, None]
+
+    @constant_property
+    def matrix(self) -> sp.csr_matrix:
+        """∇ as a SciPy matrix (m·d, n), float64; row d·j + i is direction i on face j."""
+        return _to_scipy(self._gradient)
 
     @constant_property
     def divergence_matrix(self) -> sp.csr_matrix:
@@ -117,8 +134,16 @@ def gradient_operator(mesh: Mesh) -> GradientOperator:
                 "compiled code runs"
             )
         with outside_transforms():
-            _operators[mesh] = GradientOperator(mesh)
+            gradient = SparseMatrix(_gradient_matrix(mesh), mesh.device)
+            _operators[mesh] = GradientOperator(mesh, gradient)
     return _operators[mesh]
+
+
+def concatenate_operators(union: Mesh, parts: Sequence[Mesh]) -> None:
+    """Keep for the disjoint union of meshes what was assembled for them."""
+    blocks = [gradient_operator(part)._gradient for part in parts]
+    with outside_transforms():
+        _operators[union] = GradientOperator(union, BlockDiagonal(blocks))
 
 
 def jacobians(

@@ -18,7 +18,7 @@ file, uses private ones; docs/linear_map.md says which, why, and what would repl
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
@@ -43,6 +43,24 @@ class Matrix(ABC):
     @abstractmethod
     def transposed(self) -> Matrix:
         """Aᵀ."""
+
+
+class BlockDiagonal(Matrix):
+    """A block-diagonal matrix, multiplied block by block: that of a union, of those of its parts."""
+
+    def __init__(self, blocks: Sequence[Matrix]) -> None:
+        self.blocks = blocks
+        self._columns = [block.shape[1] for block in blocks]
+        self.shape = (sum(block.shape[0] for block in blocks), sum(self._columns))
+
+    def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
+        """A x."""
+        pieces = x.split(self._columns)
+        return torch.cat([A.multiply(piece) for A, piece in zip(self.blocks, pieces, strict=True)])
+
+    def transposed(self) -> BlockDiagonal:
+        """Aᵀ."""
+        return BlockDiagonal([block.transposed() for block in self.blocks])
 
 
 class _Handle(OpaqueBase):

@@ -47,17 +47,14 @@ _OF_FACES = (
 )
 
 
-# Cached properties whose values for a union are those of its parts, one after the other.
+# Cached properties that a union takes from its parts, one after the other.
 _OF_PARTS = (
-    "_corners",
     "_double_measures",
     "_double_frames",
     "_double_vertex_measures",
     "measures",
     "frames",
     "vertex_measures",
-    "normals",
-    "vertex_normals",
 )
 
 

@@ -27,17 +27,18 @@ from torch import Tensor
 from diffpoisson import cells
 from diffpoisson.arguments import require_instances, require_integer, require_tensor
 from diffpoisson.constraints import Constraints, Gauge
-from diffpoisson.factor import BlockDiagonal, CholeskyFactor
+from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import (
     CellGeometry,
     SparseMatrix,
     as_intrinsic,
     columns_to_vertices,
+    concatenate_operators,
     gradient_operator,
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import CellwiseInverse, LinearMap, Matrix
+from diffpoisson.linear_map import BlockDiagonal, CellwiseInverse, LinearMap, Matrix
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.transforms import outside_transforms, require_equal
 
@@ -91,7 +92,10 @@ class PoissonSolver:
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
-            self._assign(mesh, constraints, factor, divergence[free], L[free][:, pinned])
+            parts = (divergence[free], L[free][:, pinned])
+            sparse = (SparseMatrix(part, mesh.device) for part in parts)
+            weights = constraints.mean_weights(mesh._double_vertex_measures)
+            self._assign(mesh, constraints, factor, *sparse, weights)
             self._require_digits()
 
     def _assign(
@@ -99,15 +103,14 @@ class PoissonSolver:
         mesh: Mesh,
         constraints: Constraints,
         factor: Matrix,
-        divergence: sp.csr_matrix,
-        coupling: sp.csr_matrix,
+        divergence: Matrix,
+        coupling: Matrix,
+        mean_weights: Float[Tensor, "n"] | None,
     ) -> None:
         """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
-        self.mesh, self.constraints = mesh, constraints
-        self._parts = (factor, divergence, coupling)
-        self._inverse = LinearMap(factor)
-        self._divergence = LinearMap(SparseMatrix(divergence, mesh.device))
-        self._coupling = LinearMap(SparseMatrix(coupling, mesh.device))
+        self.mesh, self.constraints, self._mean_weights = mesh, constraints, mean_weights
+        self._matrices = (factor, divergence, coupling)
+        self._inverse, self._divergence, self._coupling = map(LinearMap, self._matrices)
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
@@ -117,7 +120,6 @@ class PoissonSolver:
         self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
-        self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
 
     @property
     def n_floating(self) -> int:
@@ -177,14 +179,16 @@ class PoissonSolver:
         """
         require_instances("PoissonSolver.concatenate", solvers, PoissonSolver)
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
-        factors, divergences, couplings = zip(*(s._parts for s in solvers), strict=True)
+        concatenate_operators(mesh, [solver.mesh for solver in solvers])
+        constraints = Constraints.concatenate([solver.constraints for solver in solvers])
+        matrices = zip(*(solver._matrices for solver in solvers), strict=True)
+        weights = [s._mean_weights for s in solvers if s._mean_weights is not None]
         union = object.__new__(cls)
         union._assign(
             mesh,
-            Constraints.concatenate([solver.constraints for solver in solvers]),
-            BlockDiagonal(factors),
-            sp.block_diag(divergences, format="csr"),
-            sp.block_diag(couplings, format="csr"),
+            constraints,
+            *(BlockDiagonal(blocks) for blocks in matrices),
+            torch.cat(weights) if weights else None,
         )
         return union
 

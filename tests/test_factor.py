@@ -18,8 +18,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diffpoisson.factor import BlockDiagonal, CholeskyFactor
+from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import SparseMatrix
+from diffpoisson.linear_map import BlockDiagonal
 from tests import meshes
 from tests.checks import assert_near
 

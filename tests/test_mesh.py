@@ -510,7 +510,7 @@ def test_boundary_that_touches_itself_is_named():
 def test_a_union_takes_over_what_its_parts_have_computed(make):
     used = [dp.Mesh(*make(seed)) for seed in (0, 1)]
     fresh = dp.Mesh.concatenate([dp.Mesh(*make(seed)) for seed in (0, 1)])
-    names = ("measures", "frames", "vertex_measures", "normals", "vertex_normals", "_corners")
+    names = ("measures", "frames", "vertex_measures")
     for mesh in used:
         for name in (*names, "_double_measures", "_double_frames", "_double_vertex_measures"):
             getattr(mesh, name)

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from njf_models.field import FieldMLP, RowGroupNorm
+from njf_models.field import FieldMLP
 from njf_models.pointnet import PointNet
 from tests.njf_models.shapes import randomised
 
@@ -24,20 +24,33 @@ def plain_field(model: FieldMLP) -> nn.Sequential:
     return plain
 
 
-def test_row_group_norm_is_group_norm_with_gradients():
-    ours, theirs = RowGroupNorm(4, 128).double(), nn.GroupNorm(4, 128).double()
-    randomised(ours)
-    theirs.load_state_dict(ours.state_dict())
-    x = torch.randn(50, 128, dtype=torch.float64, requires_grad=True)
-    y, expected = ours(x), theirs(x)
-    assert_close(y, expected, rtol=1e-12, atol=1e-12)
-    w = torch.randn_like(y)
-    for ours_grad, theirs_grad in zip(
-        torch.autograd.grad((y * w).sum(), [x, *ours.parameters()]),
-        torch.autograd.grad((expected * w).sum(), [x, *theirs.parameters()]),
+def test_field_has_the_gradients_of_the_plain_network():
+    model = randomised(FieldMLP(20, 6))
+    plain = plain_field(model)
+    x = torch.randn(50, 26, dtype=torch.float64, requires_grad=True)
+    y = torch.cat([model(f, c) for f, c in zip(x[:, None, 20:], x[:, :20], strict=True)])
+    expected = plain(x)
+    w = torch.randn_like(expected)
+    for ours, theirs in zip(
+        torch.autograd.grad((y * w).sum(), [x, *model.parameters()]),
+        torch.autograd.grad((expected * w).sum(), [x, *plain.parameters()]),
         strict=True,
     ):
-        assert_close(ours_grad, theirs_grad, rtol=1e-10, atol=1e-10)
+        assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
+
+
+def test_field_in_float32_is_as_exact_as_the_plain_network():
+    """Also where the weights of a group share a large offset, which its norm takes out again."""
+    model = randomised(FieldMLP(20, 6, width=64))
+    with torch.no_grad():
+        model.layers[3].weight[:16] += 100.0
+        model.layers[6].bias[16:32] -= 100.0
+    features, code = torch.randn(200, 6), torch.randn(1, 20)
+    rows = torch.cat([code.expand(200, 20), features], dim=1)
+    exact = model.layers(rows.double())
+    model.float()
+    error = (model(features, code)[0] - exact).abs().max()
+    assert error < 2 * (model.layers(rows) - exact).abs().max() < 1e-2
 
 
 def test_split_first_layer_is_the_plain_network_on_code_and_features():

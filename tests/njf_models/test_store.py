@@ -181,11 +181,14 @@ def test_workers_order_and_shards_do_not_matter(store: UVStore, tmp_path: Path) 
     assert content(tmp_path) == content(store.folder)
 
 
-def test_a_dask_cluster_builds_the_same(store: UVStore, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "processes", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["threads", "processes"]
+)
+def test_a_dask_cluster_builds_the_same(store: UVStore, tmp_path: Path, processes: bool) -> None:
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with (
-        distributed.LocalCluster(processes=False, **options) as cluster,
+        distributed.LocalCluster(processes=processes, **options) as cluster,
         distributed.Client(cluster),
     ):
         build(tmp_path, backend="dask", n_jobs=-1)

@@ -316,13 +316,15 @@ def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:
 
 def _notes_on_output(file: Any, layout: Any, suffix: str) -> list[str]:
     """What is not as it was, apart from the UVs."""
-    from njf_models.meshfiles import count_crossed_polygons  # noqa: PLC0415
+    from njf_models.meshfiles import count_crossed_polygons, not_written  # noqa: PLC0415
 
     notes = []
     if file.paint is not None:
         notes.append("pictures were baked into one for the new UVs")
     if suffix == ".obj" and (crossed := count_crossed_polygons(file, layout)):
         notes.append(f"{crossed:,} polygons that seams cross were written as triangles")
+    if missing := not_written(file, suffix):
+        notes.append(f"not carried over: {', '.join(missing)}")
     return notes
 
 

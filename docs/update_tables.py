@@ -209,7 +209,34 @@ def uv_card() -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
 
 
+def data_cost() -> str:
+    """Stages and bytes of UV training data, from `tests/benchmarks/data_cost.py`."""
+    result = json.loads((RESULTS / "data_cost.json").read_text())
+    lines = []
+    for quantity, unit in (("milliseconds per patch", 1), ("bytes per patch", 1000)):
+        costs = result[quantity]
+        total = sum(costs.values())
+        name = quantity.replace("bytes", "kB")
+        lines += (
+            [f"| | {name} | share, % |", "|---|---|---|"] if not lines else [f"| **{name}** | | |"]
+        )
+        rows = [*costs.items(), ("all", total)]
+        lines += [f"| {n} | {number(c / unit)} | {number(100 * c / total)} |" for n, c in rows]
+    per_mesh = ", ".join(f"{n} {number(c)} ms" for n, c in result["milliseconds per mesh"].items())
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"{result['patches']} patches of {result['meshes']} meshes of "
+            f"{result['mesh_faces']:,} faces; on average {result['mean_faces']:.0f} faces, "
+            f"{result['mean_vertices']:.0f} vertices and {result['energies']} energies. Besides, "
+            f"once per mesh and shard: {per_mesh}.",
+        ]
+    )
+
+
 TABLES = {
+    "data_cost": data_cost,
     "uv": uv,
     "uv_card": uv_card,
     "cli_trial": cli_trial,

@@ -7,6 +7,7 @@ What a file lists is kept: its vertices, the order of its triangles, an OBJ's po
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 import diffpoisson as dp
 from njf_models.objfile import ObjFile, obj_text, parse_obj, plain_obj, whole_polygons
@@ -49,11 +50,13 @@ class MeshFile:
     Attributes:
         path: where.
         vertices: (n, 3) float64, as the file lists them; of formats that repeat vertices at every
-            triangle or seam (STL, GLB), each position once.
+            triangle or seam (STL, GLB), each position of one colour once.
         faces: (m, 3) int64, the file's triangles in order, polygons triangulated; also those
             without area.
         paint: pictures on the surface, if it has any.
         obj: the text, of an OBJ.
+        colours: (n, 4) uint8 RGBA of the vertices, as the file has them, if it does.
+        left: what else it has that no output will, in words.
     """
 
     path: Path
@@ -61,6 +64,8 @@ class MeshFile:
     faces: Int[np.ndarray, "m 3"]
     paint: Paint | None = None
     obj: ObjFile | None = None
+    colours: UInt8[np.ndarray, "n 4"] | None = None
+    left: tuple[str, ...] = ()
 
     def cleaned(self) -> dp.CleanedMesh:
         """The mesh to work on: equal positions identified, faces without area dropped.
@@ -129,7 +134,11 @@ def _read_obj(path: Path) -> MeshFile:
     if not len(obj.vertices):
         raise MeshFileError("no triangles in it: no line starts with v or f")
     faces = obj.corners[obj.triangles, 0]
-    return MeshFile(path, obj.vertices, faces, _obj_paint(path, obj), obj)
+    opaque = None
+    if obj.colours is not None:
+        rgb = np.rint(255 * obj.colours).astype(np.uint8)
+        opaque = np.pad(rgb, ((0, 0), (0, 1)), constant_values=255)
+    return MeshFile(path, obj.vertices, faces, _obj_paint(path, obj), obj, opaque)
 
 
 def _obj_paint(path: Path, obj: ObjFile) -> Paint | None:
@@ -179,23 +188,96 @@ def _read_scene(path: Path) -> MeshFile:
     starts = np.repeat(np.cumsum(sizes) - sizes, [len(part.faces) for part in surfaces])
     vertices = np.concatenate([part.vertices for part in surfaces]).astype(np.float64)
     faces = np.concatenate([part.faces for part in surfaces]).astype(np.int64) + starts[:, None]
+    wrapped = kind == "glb" and _has_wrapped_colours(path.read_bytes())
+    colours = None if wrapped else _scene_colours(surfaces)
     if kind in ("stl", "glb"):
-        vertices, faces = _each_position_once(vertices, faces)
-    return MeshFile(path, vertices, faces, _scene_paint(surfaces))
+        keys = vertices if colours is None else np.concatenate([vertices, colours], axis=1)
+        first, faces = _each_row_once(keys, faces)
+        vertices, colours = vertices[first], None if colours is None else colours[first]
+    left = (_WRAPPED,) * wrapped + _not_carried(list(scene.geometry.values()))
+    return MeshFile(path, vertices, faces, _scene_paint(surfaces), None, colours, left)
 
 
 def _placed(scene: Any, node: str) -> Any:
     transform, name = scene.graph[node]
-    return scene.geometry[name].copy().apply_transform(transform)
+    geometry = scene.geometry[name]
+    part = geometry.copy().apply_transform(transform)
+    attributes = getattr(geometry.visual, "vertex_attributes", {})
+    if "color" in attributes:  # which trimesh does not copy
+        part.visual.vertex_attributes["color"] = attributes["color"]
+    return part
 
 
-def _each_position_once(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at equal positions identified, in the order of their first appearance."""
-    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+def _each_row_once(rows: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first of each equal rows, in their order, and the faces by their places among these."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return vertices[first[order]], rank[inverse.ravel()][faces]
+    return first[order], rank[inverse.ravel()][faces]
+
+
+def _scene_colours(surfaces: list[Any]) -> UInt8[np.ndarray, "n 4"] | None:
+    """The colours of the parts' vertices, white where a part has none; None if all have none."""
+    colours = [_vertex_colours(part.visual) for part in surfaces]
+    if all(given is None for given in colours):
+        return None
+    white = np.full((1, 4), 255, dtype=np.uint8)
+    pairs = zip(colours, surfaces, strict=True)
+    return np.concatenate(
+        [white.repeat(len(part.vertices), 0) if c is None else c for c, part in pairs]
+    )
+
+
+def _vertex_colours(visual: Any) -> UInt8[np.ndarray, "n 4"] | None:
+    """Of trimesh's visuals, which keep those beside a material as the file has them."""
+    if visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)
+    given = getattr(visual, "vertex_attributes", {}).get("color")
+    if given is None:
+        return None
+    colours = np.asarray(given, dtype=np.float64)
+    if given.dtype.kind == "u":  # else in [0, 1] already
+        colours /= np.iinfo(given.dtype).max
+    colours = np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+    return np.pad(colours, ((0, 0), (0, 4 - colours.shape[1])), constant_values=255)
+
+
+_WRAPPED = "vertex colours of 16 bits without a material"
+
+
+def _has_wrapped_colours(glb: bytes) -> bool:
+    """Whether trimesh, which has read the file, kept the wrong half of 16-bit colours.
+
+    It does where there is no material.
+    """
+    tree = json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")])
+    primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"]]
+    bare = [p["attributes"].get("COLOR_0") for p in primitives if "material" not in p]
+    unsigned_short = 5123
+    return any(
+        tree["accessors"][i]["componentType"] == unsigned_short for i in bare if i is not None
+    )
+
+
+# Of trimesh's materials, and what they are called.
+_OTHER_PICTURES = {
+    "normalTexture": "normal maps",
+    "metallicRoughnessTexture": "pictures of metal and roughness",
+    "occlusionTexture": "pictures of occlusion",
+    "emissiveTexture": "pictures of emitted light",
+}
+
+
+def _not_carried(geometries: list[Any]) -> tuple[str, ...]:
+    """What the objects of a scene have that is not read here, in words."""
+    visuals = [getattr(geometry, "visual", None) for geometry in geometries]
+    words = {"colours of faces": any(getattr(v, "kind", None) == "face" for v in visuals)}
+    materials = [getattr(visual, "material", None) for visual in visuals]
+    for name, word in _OTHER_PICTURES.items():
+        words[word] = any(getattr(material, name, None) is not None for material in materials)
+    words["vertex normals"] = any("vertex_normals" in g._cache for g in geometries)
+    return tuple(word for word, present in words.items() if present)
 
 
 def _scene_paint(surfaces: list[Any]) -> Paint | None:
@@ -275,6 +357,16 @@ def count_crossed_polygons(file: MeshFile, layout: Layout) -> int:
     return 0 if file.obj is None else int((~whole_polygons(file.obj, layout.corners)).sum())
 
 
+def not_written(file: MeshFile, suffix: str) -> list[str]:
+    """What a file has that is lost when it is written with this suffix, in words."""
+    missing = list(file.left)
+    if file.obj is not None and suffix != ".obj" and file.obj.has_normals:
+        missing.append("vertex normals")
+    if file.colours is not None and suffix == ".obj" and (file.colours[:, 3] < 255).any():
+        missing.append("transparency of vertex colours")
+    return missing
+
+
 def write_mesh_file(
     path: Path, file: MeshFile, layout: Layout, *, checkerboard: bool = False
 ) -> list[Path]:
@@ -336,7 +428,10 @@ def _write_obj(
     if file.obj is not None:
         text = obj_text(file.obj, layout.uv, layout.corners, **statements)
     else:
-        text = plain_obj(file.vertices, file.faces, layout.uv, layout.corners, **statements)
+        rgb = None if file.colours is None else file.colours[:, :3] / 255
+        text = plain_obj(
+            file.vertices, file.faces, layout.uv, layout.corners, colours=rgb, **statements
+        )
     (folder / f"{stem}.obj").write_bytes(text.encode("utf-8", errors="surrogateescape"))
     return [*names, f"{stem}.obj"]
 
@@ -363,11 +458,11 @@ def _write_glb(
         roughnessFactor=1.0,
         doubleSided=True,
     )
+    visual = trimesh.visual.TextureVisuals(layout.uv[texcoord], material=material)
+    if file.colours is not None:
+        visual.vertex_attributes["color"] = file.colours[vertex]
     mesh = trimesh.Trimesh(
-        file.vertices[vertex],
-        index.reshape(-1, 3),
-        visual=trimesh.visual.TextureVisuals(layout.uv[texcoord], material=material),
-        process=False,
+        file.vertices[vertex], index.reshape(-1, 3), visual=visual, process=False
     )
     mesh.export(folder / f"{stem}.glb")
     return [f"{stem}.glb"]

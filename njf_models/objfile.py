@@ -24,6 +24,8 @@ class ObjFile:
     Attributes:
         lines: the statements and comments, continued lines joined.
         vertices: (n, 3) float64, in the file's order.
+        colours: (n, 3) float64 in [0, 1] where lines of vertices go on with colours; white where
+            others do not; None where none does, or where the numbers are none.
         texcoords: (t, 2) float64.
         corners: (c, 2) int64, vertex and texcoord of the corners of all polygons, -1 for none.
         sizes: (p,) corners of each polygon.
@@ -37,6 +39,7 @@ class ObjFile:
 
     lines: list[str]
     vertices: Float[np.ndarray, "n 3"]
+    colours: Float[np.ndarray, "n 3"] | None
     texcoords: Float[np.ndarray, "t 2"]
     corners: Int[np.ndarray, "c 2"]
     sizes: Int[np.ndarray, "p"]
@@ -47,6 +50,11 @@ class ObjFile:
     triangles: Int[np.ndarray, "m 3"]
     polygon_of_triangle: Int[np.ndarray, "m"]
 
+    @property
+    def has_normals(self) -> bool:
+        """Whether it lists vertex normals."""
+        return any(line.startswith(("vn ", "vn\t")) for line in self.lines)
+
 
 def parse_obj(text: str) -> ObjFile:
     """Read vertices, texture coordinates and polygons.
@@ -56,6 +64,7 @@ def parse_obj(text: str) -> ObjFile:
     """
     lines = text.replace("\r\n", "\n").replace("\\\n", " ").split("\n")
     vertices: list[list[float]] = []
+    colours: dict[int, list[float]] = {}
     texcoords: list[list[float]] = []
     corners: list[tuple[int, int]] = []
     sizes, line_of_polygon, material_of_polygon = [], [], []
@@ -67,6 +76,8 @@ def parse_obj(text: str) -> ObjFile:
         try:
             if keyword == "v":
                 x, y, z = map(float, values[:3])
+                if len(values) == 6:
+                    colours[len(vertices)] = [float(c) for c in values[3:]]
                 vertices.append([x, y, z])
             elif keyword == "vt":
                 texcoords.append([float(x) for x in (*values, "0")[:2]])
@@ -94,6 +105,7 @@ def parse_obj(text: str) -> ObjFile:
     return ObjFile(
         lines,
         positions,
+        _colours(colours, len(positions)),
         np.array(texcoords, dtype=np.float64).reshape(-1, 2),
         corner_array,
         np.array(sizes, dtype=np.int64),
@@ -104,6 +116,16 @@ def parse_obj(text: str) -> ObjFile:
         triangles,
         polygon_of_triangle,
     )
+
+
+def _colours(of_vertex: dict[int, list[float]], n: int) -> Float[np.ndarray, "n 3"] | None:
+    """Colours of some of the vertices, which some programs write up to 255, in [0, 1]."""
+    given = np.array(list(of_vertex.values()), dtype=np.float64).reshape(-1, 3)
+    if not len(given) or not ((given >= 0) & (given <= 255)).all():  # others write normals there
+        return None
+    colours = np.ones((n, 3))
+    colours[list(of_vertex)] = given / 255 if given.max() > 1 else given
+    return colours
 
 
 def obj_text(
@@ -168,12 +190,20 @@ def plain_obj(
     texcoords: Float[np.ndarray, "t 2"],
     triangle_texcoords: Int[np.ndarray, "m 3"],
     *,
+    colours: Float[np.ndarray, "n 3"] | None = None,
     library: str | None = None,
     material: str | None = None,
 ) -> str:
-    """An OBJ of triangles: vertices once, texture coordinates once per side of a seam."""
+    """An OBJ of triangles: vertices once, texture coordinates once per side of a seam.
+
+    Colours in [0, 1] follow the positions, as many programs read them.
+    """
     head = _statement("mtllib", library)
-    head += [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    if colours is not None:
+        pairs = zip(lines, colours.tolist(), strict=True)
+        lines = [f"{line} {r:.6g} {g:.6g} {b:.6g}" for line, (r, g, b) in pairs]
+    head += lines
     head += [f"vt {u:.9g} {v:.9g}" for u, v in texcoords.tolist()]
     head += _statement("usemtl", material)
     corners = np.stack([faces, triangle_texcoords], axis=-1).reshape(-1, 6) + 1

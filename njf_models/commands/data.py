@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from njf_models.commands import UsageError
 
 if TYPE_CHECKING:
-    from njf_models.datasets.sources import RawMesh
+    from njf_models.datasets.sources import MeshFolder
+    from njf_models.datasets.store import UVStore
 
 _EXAMPLE = """\
 examples:
@@ -56,25 +59,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Build the store and print what it holds."""
-    from njf_models.datasets.build import (  # noqa: PLC0415  (seconds to import)
-        StoreSettings,
-        build_store,
-    )
-    from njf_models.datasets.patches import PatchOptions  # noqa: PLC0415
-
-    smallest, largest = options.faces
-    limits = PatchOptions(smallest, largest, options.min_flatness)
-    settings = StoreSettings(limits, options.energies, options.seed)
-    sources = _sources(options)
-    _connect(options)
-    store = build_store(
-        options.out,
-        sources,
-        options.patches,
-        settings,
-        n_jobs=options.jobs,
-        backend=options.backend,
-    )
+    folders = _folders(options)
+    try:
+        with _cluster(options):
+            store = _build(options, folders)
+    finally:
+        for path, reason in chain(*(folder.failures.items() for folder in folders)):
+            print(f"njf data: skipped {path}: {reason}", file=sys.stderr)
     draws = ", ".join(f"{count} {reason}" for reason, count in store.counts.most_common())
     print(f"{len(store)} patches of {len(store.sources)} meshes in {options.out}")
     print(f"draws: {draws}")
@@ -82,23 +73,45 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _sources(options: argparse.Namespace) -> Iterator[RawMesh]:
-    from njf_models.datasets.sources import Bent, CSGParts, MeshFolder  # noqa: PLC0415
+def _build(options: argparse.Namespace, folders: list[MeshFolder]) -> UVStore:
+    from njf_models.datasets.build import (  # noqa: PLC0415  (seconds to import)
+        StoreSettings,
+        build_store,
+    )
+    from njf_models.datasets.patches import PatchOptions  # noqa: PLC0415
+    from njf_models.datasets.sources import Bent, CSGParts  # noqa: PLC0415
 
-    folders = [MeshFolder(folder, options.licence) for folder in options.meshes]
-    if not folders and not options.csg:
+    smallest, largest = options.faces
+    limits = PatchOptions(smallest, largest, options.min_flatness)
+    return build_store(
+        options.out,
+        Bent(chain(*folders, CSGParts(options.csg, options.seed)), options.bent, options.seed),
+        options.patches,
+        StoreSettings(limits, options.energies, options.seed),
+        n_jobs=options.jobs,
+        backend=options.backend,
+    )
+
+
+def _folders(options: argparse.Namespace) -> list[MeshFolder]:
+    from njf_models.datasets.sources import MeshFolder  # noqa: PLC0415
+
+    if not options.meshes and not options.csg:
         raise UsageError("no meshes: pass --meshes FOLDER or --csg N")
-    meshes = chain(*folders, CSGParts(options.csg, options.seed))
-    return iter(Bent(meshes, options.bent, options.seed))
+    return [MeshFolder(folder, options.licence) for folder in options.meshes]
 
 
-def _connect(options: argparse.Namespace) -> None:
-    """Make the cluster known to joblib."""
+@contextmanager
+def _cluster(options: argparse.Namespace) -> Iterator[None]:
+    """While it is open, joblib knows the cluster; one that was started here ends with it."""
     if options.backend == "dask":
         from distributed import Client  # noqa: PLC0415
 
-        Client(options.scheduler)  # type: ignore[no-untyped-call]
-    elif options.backend == "ray":
+        with Client(options.scheduler):  # type: ignore[no-untyped-call]
+            yield
+        return
+    if options.backend == "ray":
         from ray.util.joblib import register_ray  # noqa: PLC0415
 
         register_ray()
+    yield

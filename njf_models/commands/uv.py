@@ -1,4 +1,4 @@
-"""`njf uv`: UV maps for mesh files, one or a folder of them."""
+"""`njf uv`: UV maps for mesh files: one, several, or a folder of them."""
 
 from __future__ import annotations
 
@@ -31,9 +31,12 @@ _EPILOG = """\
 examples:
   njf uv bunny.obj bunny_uv.obj
   njf uv scan.ply scan.glb --checkerboard --report scan.html
+  njf uv a.obj b.ply c.stl unwrapped/
   njf uv scans/ unwrapped/ --recursive --format glb --jobs 4 --json results.json
   njf uv part.stl --json -              only the figures
 
+Of several names the last is the output. It is a folder after several inputs, where it exists as
+one, or with a slash at its end; what is written there is called like its input.
 UVs lie in the unit square, both axes by the same scale.
 exit codes: 0 every file was mapped, 1 some were not, 2 wrong usage, 130 interrupted
 """
@@ -44,18 +47,30 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         "uv",
         help="give meshes UVs",
+        usage="njf uv [options] INPUT [OUTPUT]\n       njf uv [options] INPUT... FOLDER",
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument(
+        "names",
+        nargs="+",
+        metavar="INPUT",
+        help="obj, ply, off, stl or glb files, or a folder of them; then where to write: an obj or "
+        "glb file, or a folder",
+    )
+    _add_options(parser)
+    _add_batch_options(parser.add_argument_group("several files"))
+    return parser
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("input", type=Path, help="obj, ply, off, stl or glb file, or a folder of them")
-    add("output", type=Path, nargs="?", help="obj or glb file; a folder, if the input is one")
     add(
         "--report",
         type=Path,
         metavar="PAGE.html",
-        help="write a page to look at the map, beside SLIM and LSCM; a folder of them for a folder",
+        help="write a page to look at the map, beside SLIM and LSCM; of several files, a folder",
     )
     add("--json", metavar="FILE", help="write figures and failures as JSON; - for stdout")
     add(
@@ -77,26 +92,29 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         action="store_true",
         help="texture the output with a checkerboard, unless it has pictures of its own",
     )
-    folders = parser.add_argument_group("folders")
-    folders.add_argument(
-        "--format",
-        choices=("obj", "glb"),
-        default="obj",
-        help="of the files written (default: obj)",
-    )
-    folders.add_argument("--recursive", action="store_true", help="look into subfolders too")
-    folders.add_argument(
-        "--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)"
-    )
-    return parser
+
+
+def _add_batch_options(group: Any) -> None:
+    add = group.add_argument
+    add("--format", choices=("obj", "glb"), default="obj", help="written to folders (default: obj)")
+    add("--recursive", action="store_true", help="look into subfolders of the input too")
+    add("--jobs", type=_count, default=1, metavar="N", help="files at a time (default: 1)")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Map one file or a folder; 1 if any file failed."""
-    _check_usage(options)
-    single = not options.input.is_dir()
-    records = [convert(_single(options))] if single else _batch(_folder(options), options)
-    return _finish(records, options, single)
+    """Map what was named; 1 if any file failed."""
+    *names, last = options.names
+    sources = [Path(name) for name in names or [last]]
+    target = last if names else None
+    if len(sources) > 1 or sources[0].is_dir():
+        tasks = _tasks_of_batch(options, sources, target and Path(target))
+        return _finish(_batch(tasks, options), options, _root(sources))
+    return _finish([convert(_task_of_file(options, sources[0], target))], options, None)
+
+
+def _root(sources: list[Path]) -> Path:
+    """What the names of a batch's files are shown relative to."""
+    return sources[0] if sources[0].is_dir() else Path()
 
 
 # -------------------------------------------------------------------- what to do
@@ -117,27 +135,6 @@ class Task:
     debug: bool
 
 
-def _check_usage(options: argparse.Namespace) -> None:
-    source, target = options.input, options.output
-    if source.is_dir():
-        if target is not None and target.is_file():
-            raise UsageError(f"{target} is a file, but the input is a folder: name a folder")
-        if target is not None and target.resolve() == source.resolve():
-            raise UsageError("input and output are the same folder: name another one")
-        return
-    for path in (target, options.report):
-        if path is not None and path.is_dir():
-            raise UsageError(f"{path} is a folder, but the input is a file: name a file")
-    if target is None:
-        return
-    from njf_models.meshfiles import WRITABLE  # noqa: PLC0415  (imports torch)
-
-    if target.suffix.lower() not in WRITABLE:
-        raise UsageError(f"{target}: only {' and '.join(WRITABLE)} files are written")
-    if target.resolve() == source.resolve():
-        raise UsageError("input and output are the same file: name another one")
-
-
 def _task(
     options: argparse.Namespace, source: Path, output: Path | None, page: Path | None
 ) -> Task:
@@ -155,29 +152,89 @@ def _task(
     )
 
 
-def _single(options: argparse.Namespace) -> Task:
-    return _task(options, options.input, options.output, options.report)
+def _task_of_file(options: argparse.Namespace, source: Path, target: str | None) -> Task:
+    """Of a single file, whose output may be a file or go into a folder."""
+    from njf_models.meshfiles import WRITABLE  # noqa: PLC0415  (imports torch)
+
+    if options.report is not None and options.report.is_dir():
+        raise UsageError(f"{options.report} is a folder, but the input is a file: name a file")
+    if target is None:
+        return _task(options, source, None, options.report)
+    output = Path(target)
+    if target.endswith("/") or output.is_dir():
+        output = _inside(output, source.name, options.format)
+    if output.suffix.lower() not in WRITABLE:
+        raise UsageError(f"{output}: only {' and '.join(WRITABLE)} files are written")
+    _require_others([output], [source])
+    return _task(options, source, output, options.report)
 
 
-def _folder(options: argparse.Namespace) -> list[Task]:
-    """A task for each mesh file, outputs in the same subfolders."""
+def _tasks_of_batch(
+    options: argparse.Namespace, sources: list[Path], target: Path | None
+) -> list[Task]:
+    """A task for each file of several, or of a folder, whose outputs are named alike."""
+    many = "the input is a folder" if len(sources) == 1 else "there are several inputs"
+    for path in (target, options.report):
+        if path is not None and _is_a_file(path):
+            raise UsageError(f"{path} is a file, but {many}: name a folder")
+    names = _in_folder(options, sources[0], target) if len(sources) == 1 else _several(sources)
+    tasks = [
+        _task(
+            options,
+            path,
+            target and _inside(target, name, options.format),
+            options.report and _inside(options.report, name, "html"),
+        )
+        for path, name in names.items()
+    ]
+    _require_others([task.output for task in tasks if task.output is not None], list(names))
+    return tasks
+
+
+def _is_a_file(path: Path) -> bool:
+    """Also one that is not there yet, by a name that nobody gives a folder."""
+    named = path.suffix.lower() in (".glb", ".html", ".obj", ".off", ".ply", ".stl")
+    return path.is_file() or (named and not path.is_dir())
+
+
+def _inside(folder: Path, name: Path | str, suffix: str) -> Path:
+    return (folder / name).with_suffix(f".{suffix}")
+
+
+def _several(sources: list[Path]) -> dict[Path, Path]:
+    """Each file, and its name without folders."""
+    for path in sources:
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder, but there are several inputs: name files")
+    return {path: Path(path.name) for path in sources}
+
+
+def _in_folder(options: argparse.Namespace, root: Path, target: Path | None) -> dict[Path, Path]:
+    """The mesh files in a folder, and their names below it; but none that was written there."""
     from njf_models.meshfiles import READABLE  # noqa: PLC0415  (imports torch)
 
-    root = options.input
-    found = sorted(root.rglob("*") if options.recursive else root.glob("*"))
-    own = [folder.resolve() for folder in (options.output, options.report) if folder is not None]
-    tasks = []
-    for path in found:
-        mine = any(path.resolve().is_relative_to(folder) for folder in own)
-        if path.suffix.lower() in READABLE and path.is_file() and not mine:
-            name = path.relative_to(root)
-            output = options.output and options.output / name.with_suffix(f".{options.format}")
-            page = options.report and options.report / name.with_suffix(".html")
-            tasks.append(_task(options, path, output, page))
-    if not tasks:
+    own = [folder.resolve() for folder in (target, options.report) if folder is not None]
+    if root.resolve() in own:
+        raise UsageError("input and output are the same folder: name another one")
+    found = {
+        path: path.relative_to(root)
+        for path in sorted(root.rglob("*") if options.recursive else root.glob("*"))
+        if path.suffix.lower() in READABLE
+        and path.is_file()
+        and not any(path.resolve().is_relative_to(folder) for folder in own)
+    }
+    if not found:
         hint = "" if options.recursive else "; --recursive looks into subfolders"
         raise CommandError(f"no {', '.join(READABLE)} file in {root}{hint}")
-    return tasks
+    return found
+
+
+def _require_others(outputs: list[Path], sources: list[Path]) -> None:
+    """No input may be overwritten."""
+    inputs = {path.resolve() for path in sources}
+    for path in outputs:
+        if path.resolve() in inputs:
+            raise UsageError(f"{path} is both input and output: name another place")
 
 
 # -------------------------------------------------------------------- one file
@@ -259,13 +316,15 @@ def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:
 
 def _notes_on_output(file: Any, layout: Any, suffix: str) -> list[str]:
     """What is not as it was, apart from the UVs."""
-    from njf_models.meshfiles import count_crossed_polygons  # noqa: PLC0415
+    from njf_models.meshfiles import count_crossed_polygons, not_written  # noqa: PLC0415
 
     notes = []
     if file.paint is not None:
         notes.append("pictures were baked into one for the new UVs")
     if suffix == ".obj" and (crossed := count_crossed_polygons(file, layout)):
         notes.append(f"{crossed:,} polygons that seams cross were written as triangles")
+    if missing := not_written(file, suffix):
+        notes.append(f"not carried over: {', '.join(missing)}")
     return notes
 
 
@@ -291,14 +350,14 @@ def _batch(tasks: list[Task], options: argparse.Namespace) -> list[dict[str, Any
     from tqdm import tqdm  # noqa: PLC0415
 
     records: list[dict[str, Any] | None] = [None] * len(tasks)
-    taken: dict[Path | None, Path] = {}
+    taken: dict[Path, Path] = {}
     todo = []
     for i, task in enumerate(tasks):
-        if task.output is not None and task.output in taken:
-            error = f"{task.output} is what {taken[task.output].name} becomes: rename one of them"
+        place = task.output or task.report
+        if place is not None and taken.setdefault(place, task.input) != task.input:
+            error = f"{place} is what {taken[place]} becomes: rename one of them"
             records[i] = {"input": str(task.input), "status": "failed", "error": error}
         else:
-            taken[task.output] = task.input
             todo.append(i)
     with _Workers(options.jobs) as workers:
         futures = {workers.submit(tasks[i]): i for i in todo}
@@ -368,9 +427,9 @@ def _child(task: Task, sender: Connection) -> None:
 # -------------------------------------------------------------------- what came of it
 
 
-def _finish(records: list[dict[str, Any]], options: argparse.Namespace, single: bool) -> int:
+def _finish(records: list[dict[str, Any]], options: argparse.Namespace, root: Path | None) -> int:
     failures = [record for record in records if record["status"] != "ok"]
-    lines = list(_summary(records, None if single else options.input))
+    lines = list(_summary(records, root))
     to_stdout = options.json == "-"
     if lines:
         print("\n".join(lines), file=sys.stderr if to_stdout else sys.stdout)
@@ -381,20 +440,24 @@ def _finish(records: list[dict[str, Any]], options: argparse.Namespace, single: 
     return 1 if failures else 0
 
 
-def _summary(records: list[dict[str, Any]], folder: Path | None) -> Iterator[str]:
-    """A line per file, and of a batch one more with the counts."""
+def _summary(records: list[dict[str, Any]], root: Path | None) -> Iterator[str]:
+    """A line per file, and of a batch, whose names are shown below its root, the counts."""
     paths = [Path(record["input"]) for record in records]
-    names = [str(path.relative_to(folder)) if folder else path.name for path in paths]
+    names = [path.name if root is None else _shown(path, root) for path in paths]
     width = max(map(len, names))
     for name, record in zip(names, records, strict=True):
         if record["status"] == "ok":
             yield f"{name:<{width}}  {_line(record)}"
             yield from (f"{'':<{width}}  {note}" for note in record["notes"])
-        elif folder:
+        elif root is not None:
             yield f"{name:<{width}}  FAILED"
-    if folder:
+    if root is not None:
         failed = sum(record["status"] != "ok" for record in records)
         yield f"{len(records)} files: {len(records) - failed} mapped, {failed} failed"
+
+
+def _shown(path: Path, root: Path) -> str:
+    return str(path.relative_to(root) if path.is_relative_to(root) else path)
 
 
 def _line(record: dict[str, Any]) -> str:

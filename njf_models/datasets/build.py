@@ -8,11 +8,13 @@ cluster that share no file system with it. What a shard holds depends on its tas
 from __future__ import annotations
 
 import json
+import signal
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,6 +104,7 @@ def build_store(
     bar = tqdm(desc="UV patches", unit="patch", disable=not progress)
     try:
         with joblib.parallel_config(backend=backend, n_jobs=n_jobs):
+            _start_workers(backend)
             parallel = joblib.Parallel(return_as="generator_unordered")
             jobs = (joblib.delayed(_run)(task, settings) for task in _missing(tasks, bar))
             counts: Counter[str] = Counter()
@@ -114,6 +117,22 @@ def build_store(
         bar.close()
         _summarise(folder, settings)
     return UVStore(folder)
+
+
+def _start_workers(backend: str) -> None:
+    """Start processes that never see an interrupt, which a terminal sends to them too.
+
+    The calling process gets it alone, and ends them. Blocked signals are inherited, also by the
+    threads that start other processes later.
+    """
+    if backend != "loky":
+        return
+    resource_tracker.ensure_running()  # which unblocks the signal in Python 3.11
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        joblib.Parallel()([joblib.delayed(int)()])
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def build_shard(

@@ -76,18 +76,21 @@ def test_help_of_a_command_has_examples_that_parse(command, capsys):
         assert parser().parse_args(example.split()).command == command
 
 
-def test_the_page_of_the_docs_agrees_with_the_parser():
+@pytest.mark.parametrize(
+    ("command", "page", "count"), [("uv", "cli.md", 6), ("data", "data.md", 3)]
+)
+def test_the_page_of_the_docs_agrees_with_the_parser(command, page, count):
     """Its examples parse, and it knows every option."""
     from njf_models.cli import parser
 
-    text = (ROOT / "docs" / "cli.md").read_text()
+    text = (ROOT / "docs" / page).read_text()
     examples = re.findall(r"^\$ njf (.*)$", text, re.MULTILINE)
-    assert len(examples) >= 6
+    assert len(examples) >= count
     for example in examples:
         assert parser().parse_args(example.split()).command == example.split()[0]
     commands = parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
-    options = {o for action in commands["uv"]._actions for o in action.option_strings}  # type: ignore[index]
-    for option in options - {"-h", "--help"}:
+    options = {o for action in commands[command]._actions for o in action.option_strings}  # type: ignore[index]
+    for option in options - {"-h", "--help", "--debug"}:
         assert f"`{option}" in text
 
 
@@ -116,10 +119,17 @@ def test_version(capsys):
     [
         ([], "the following arguments are required: COMMAND"),
         (["unwrap"], "invalid choice: 'unwrap'"),
-        (["uv"], "the following arguments are required: input"),
+        (["uv"], "the following arguments are required: INPUT"),
         (["uv", "a.obj", "b.fbx"], "njf uv: b.fbx: only .glb and .obj files are written"),
-        (["uv", "a.obj", "a.obj"], "input and output are the same file"),
-        (["uv", "a.obj", "."], ". is a folder, but the input is a file"),
+        (["uv", "a.obj", "a.obj"], "a.obj is both input and output"),
+        (["uv", "a.obj", "."], "a.obj is both input and output"),
+        (["uv", "a.obj", "b.ply", "."], "a.obj is both input and output"),
+        (["uv", "a.obj", "out"], "out: only .glb and .obj files are written"),
+        (["uv", "a.obj", "b.obj", "--report", "."], ". is a folder, but the input is a file"),
+        (["uv", "a.obj", "b.obj", "c.obj"], "c.obj is a file, but there are several inputs"),
+        (["uv", "a.obj", "b.obj", "LICENSE"], "LICENSE is a file, but there are several inputs"),
+        (["uv", "a.obj", "b.obj", "o", "--report", "p.html"], "p.html is a file, but there are"),
+        (["uv", "a.obj", "docs", "out"], "docs is a folder, but there are several inputs"),
         (["uv", ".", "pyproject.toml"], "pyproject.toml is a file, but the input is a folder"),
         (["uv", ".", "."], "input and output are the same folder"),
         (["uv", "a.obj", "--tolerance", "0"], "0 is not a positive number"),
@@ -338,7 +348,7 @@ def test_a_folder_survives_bad_files(folder, tmp_path, capsys):
     failed = {Path(r["input"]).name: r["error"] for r in result["files"] if r["status"] != "ok"}
     assert set(failed) == {"a.off", "empty.ply", "picture.obj"}
     assert result["failed"] == 3
-    assert "is what a.obj becomes" in failed["a.off"]
+    assert f"is what {folder}/a.obj becomes" in failed["a.off"]
 
 
 def test_a_folder_without_meshes(tmp_path, capsys):
@@ -352,9 +362,52 @@ def test_own_output_is_not_input(folder):
     from njf_models.cli import parser
 
     parsed = parser().parse_args(["uv", str(folder), str(folder / "deep"), *options])
-    assert {task.input.name for task in uv._folder(parsed)} == {
-        *("a.obj", "a.off", "empty.ply", "picture.obj")
+    tasks = uv._tasks_of_batch(parsed, [folder], folder / "deep")
+    assert {task.input.name for task in tasks} == {*("a.obj", "a.off", "empty.ply", "picture.obj")}
+
+
+def test_pages_of_equal_names_are_not_overwritten(tmp_path, capsys):
+    for name in ("a.obj", "a.off"):
+        save(tmp_path / "in" / name, meshes.disk(0, 5))
+    assert tutte(tmp_path / "in", "--report", tmp_path / "pages") == 1
+    assert "a.html is what" in capsys.readouterr().err
+
+
+# ------------------------------------------------------- several files
+
+
+def test_several_files_into_a_folder(tmp_path, capsys, monkeypatch):
+    """What a shell makes of `njf uv *.obj more/c.ply out`: one bad file, two of one name."""
+    monkeypatch.chdir(tmp_path)
+    save(Path("a.obj"), meshes.disk(0, 5))
+    Path("b.obj").write_bytes(PNG)
+    save(Path("more/c.ply"), meshes.disk(1, 5))
+    save(Path("more/a.off"), meshes.disk(2, 5))
+    names = ["a.obj", "b.obj", "more/c.ply", "more/a.off"]
+    options = ["--report", "pages", "--json", "all.json", "--format", "glb"]
+    assert tutte(*names, "out", *options) == 1
+    printed = capsys.readouterr()
+    lines = printed.out.strip().split("\n")
+    assert [line.split()[0] for line in lines[:-1]] == names
+    assert lines[-1] == "4 files: 2 mapped, 2 failed"
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a.glb", "c.glb"]
+    assert sorted(path.name for path in Path("pages").iterdir()) == ["a.html", "c.html"]
+    result = json.loads(Path("all.json").read_text())
+    errors = {r["input"]: r["error"] for r in result["files"] if r["status"] != "ok"}
+    assert errors == {
+        "b.obj": "this is a PNG picture, not a mesh",
+        "more/a.off": "out/a.glb is what a.obj becomes: rename one of them",
     }
+
+
+@pytest.mark.parametrize(("typed", "exists"), [("out/", False), ("out", True), ("out/", True)])
+def test_one_file_into_a_folder(disk, tmp_path, monkeypatch, typed, exists):
+    """`njf uv *.obj out/` where there is only one; a name alone is no folder yet."""
+    monkeypatch.chdir(tmp_path)
+    if exists:
+        Path("out").mkdir()
+    assert tutte(disk, typed) == 0
+    assert [path.name for path in Path("out").iterdir()] == ["disk.obj"]
 
 
 class Bomb(type(Path())):  # type: ignore[misc]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -438,3 +440,162 @@ def test_a_checkerboard_where_there_is_no_picture(tmp_path):
     write_mesh_file(tmp_path / "out.obj", file, layout, checkerboard=True)
     image = np.asarray(trimesh.load_mesh(tmp_path / "out.obj").visual.material.image)
     assert len(np.unique(image.reshape(-1, image.shape[-1]), axis=0)) == 2
+
+
+# ------------------------------------------------------- colours of vertices
+
+
+def coloured_sphere(path: Path, opaque: bool = True) -> np.ndarray:
+    """Write a sphere of random colours; positions and colours of its vertices."""
+    vertices, faces = meshes.sphere()
+    colours = np.random.default_rng(0).integers(0, 256, (len(vertices), 4)).astype(np.uint8)
+    if opaque:
+        colours[:, 3] = 255
+    trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False).export(path)
+    return np.concatenate([vertices, colours], axis=1)
+
+
+def coloured_corners(path: Path) -> np.ndarray:
+    """Sorted rows of position and colour of all corners, by trimesh or from the text."""
+    if path.suffix == ".glb":
+        (mesh,) = trimesh.load_scene(path, process=False).geometry.values()
+        rows = np.concatenate([mesh.vertices, mesh.visual.vertex_attributes["color"]], axis=1)
+        corners = rows[mesh.faces]
+    else:
+        lines = [line.split() for line in path.read_text().split("\n")]
+        rows = np.array([line[1:] for line in lines if line[:1] == ["v"]], dtype=np.float64)
+        rows[:, 3:] *= 255
+        index = [[int(word.split("/")[0]) for word in x[1:]] for x in lines if x[:1] == ["f"]]
+        corners = rows[np.array(index) - 1]
+    return np.array(sorted(corners.round(3).reshape(len(corners), -1).tolist()))
+
+
+@pytest.mark.parametrize("source", [".ply", ".obj", ".glb"])
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_colours_of_vertices_are_carried_through_the_cut(tmp_path, source, suffix):
+    rows = coloured_sphere(tmp_path / f"in{source}")
+    file = read_mesh_file(tmp_path / f"in{source}")
+    cleaned = file.cleaned()
+    layout = meshfiles.unit_square_layout(file, cleaned, dp.parameterize(cleaned.mesh, cut=True))
+    write_mesh_file(tmp_path / f"out{suffix}", file, layout)
+    assert len(layout.uv) > len(rows)  # there are seams
+    columns = rows if suffix == ".glb" else rows[:, :6]
+    corners = columns[meshes.sphere()[1]].round(3)
+    expected = np.array(sorted(corners.reshape(len(corners), -1).tolist()))
+    np.testing.assert_allclose(coloured_corners(tmp_path / f"out{suffix}"), expected, atol=2e-3)
+    assert meshfiles.not_written(file, suffix) == []
+
+
+def test_colours_that_meet_at_a_position_stay_apart(tmp_path):
+    """A GLB lists a vertex per colour; the geometry is joined all the same."""
+    vertices, faces = meshes.sphere()
+    soup = trimesh.Trimesh(vertices[faces].reshape(-1, 3), process=False)
+    soup.faces = np.arange(3 * len(faces)).reshape(-1, 3)
+    colours = np.repeat(np.random.default_rng(0).integers(0, 256, (len(faces), 3)), 3, axis=0)
+    soup.visual.vertex_colors = colours.astype(np.uint8)
+    soup.export(tmp_path / "a.glb")
+    file = read_mesh_file(tmp_path / "a.glb")
+    assert file.colours is not None
+    np.testing.assert_array_equal(file.colours[file.faces].reshape(-1, 4)[:, :3], colours)
+    assert file.cleaned().mesh.n_vertices == len(vertices)
+
+
+def test_objects_without_colours_are_white_among_others(tmp_path):
+    scene = trimesh.Scene([trimesh.creation.box(), trimesh.creation.icosahedron()])
+    next(iter(scene.geometry.values())).visual.vertex_colors = [10, 20, 30, 255]
+    scene.export(tmp_path / "a.glb")
+    colours = read_mesh_file(tmp_path / "a.glb").colours
+    assert colours is not None
+    assert sorted(map(tuple, np.unique(colours, axis=0).tolist())) == [
+        (10, 20, 30, 255),
+        (255, 255, 255, 255),
+    ]
+
+
+def triangle_glb(colours: np.ndarray, component: int, material: bool) -> bytes:
+    """A triangle, by the letter of the glTF specification."""
+    points = np.eye(3, dtype=np.float32).tobytes()
+    size = len(points) + colours.nbytes
+    primitive: dict = {"attributes": {"POSITION": 0, "COLOR_0": 1}}
+    tree = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": size}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": len(points)},
+            {"buffer": 0, "byteOffset": len(points), "byteLength": colours.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": component, "count": 3, "type": "VEC4"}
+            | ({} if component == 5126 else {"normalized": True}),
+        ],
+    }
+    if material:
+        tree["materials"] = [{}]
+        primitive["material"] = 0
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + size, len(text), 0x4E4F534A)
+    return head + text + struct.pack("<II", size, 0x004E4942) + points + colours.tobytes()
+
+
+@pytest.mark.parametrize("material", [True, False])
+@pytest.mark.parametrize(("component", "dtype"), [(5121, "u1"), (5123, "<u2"), (5126, "<f4")])
+def test_colours_of_all_types(tmp_path, component, dtype, material):
+    wanted = np.array([[255, 0, 51, 255], [0, 102, 255, 255], [1, 2, 3, 204]])
+    largest = {"u1": 255, "<u2": 65535, "<f4": 1.0}[dtype]
+    stored = (wanted / 255 * largest).astype(dtype)
+    (tmp_path / "a.glb").write_bytes(triangle_glb(stored, component, material))
+    file = read_mesh_file(tmp_path / "a.glb")
+    if dtype == "<u2" and not material:
+        assert file.colours is None
+        assert "vertex colours of 16 bits" in meshfiles.not_written(file, ".glb")[0]
+    else:
+        np.testing.assert_array_equal(file.colours, wanted)
+        assert meshfiles.not_written(file, ".obj") == ["transparency of vertex colours"]
+        assert meshfiles.not_written(file, ".glb") == []
+
+
+@pytest.mark.parametrize(
+    ("numbers", "expected"),
+    [
+        ("1 0.2 0", [255, 51, 0, 255]),
+        ("255 51 0", [255, 51, 0, 255]),
+        ("0 0 -1", None),  # normals, as some programs write them
+        ("1 0 nan", None),
+        ("1", None),  # a weight
+    ],
+)
+def test_colours_of_an_obj(tmp_path, numbers, expected):
+    text = f"v 0 0 0 {numbers}\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    colours = read_mesh_file(write(tmp_path, "a.obj", text)).colours
+    if expected is None:
+        assert colours is None
+    else:
+        np.testing.assert_array_equal(colours, [expected, [255] * 4, [255] * 4])
+
+
+def test_what_is_lost_is_named(tmp_path):
+    rows = meshes.sphere()
+    faces = trimesh.Trimesh(*rows, face_colors=[200, 0, 0, 255], process=False)
+    faces.export(tmp_path / "faces.ply")
+    assert meshfiles.not_written(read_mesh_file(tmp_path / "faces.ply"), ".obj") == [
+        "colours of faces"
+    ]
+    smooth = trimesh.Trimesh(*rows, process=False)
+    assert len(smooth.vertex_normals)  # made at their first use
+    smooth.visual = trimesh.visual.TextureVisuals(
+        np.zeros((len(rows[0]), 2)),
+        trimesh.visual.material.PBRMaterial(normalTexture=Image.fromarray(gradient(4, 4))),
+    )
+    smooth.export(tmp_path / "smooth.glb")
+    assert meshfiles.not_written(read_mesh_file(tmp_path / "smooth.glb"), ".glb") == [
+        "normal maps",
+        "vertex normals",
+    ]
+    cube = read_mesh_file(write(tmp_path, "cube.obj", CUBE))
+    assert meshfiles.not_written(cube, ".obj") == []
+    assert meshfiles.not_written(cube, ".glb") == ["vertex normals"]

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ import torch
 from hypothesis import given
 from torch.utils.data import DataLoader
 
+from njf_models.cli import main
 from njf_models.datasets import build as build_module
 from njf_models.datasets.build import StoreSettings, build_store
 from njf_models.datasets.fingerprint import fingerprint
@@ -181,11 +184,14 @@ def test_workers_order_and_shards_do_not_matter(store: UVStore, tmp_path: Path) 
     assert content(tmp_path) == content(store.folder)
 
 
-def test_a_dask_cluster_builds_the_same(store: UVStore, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "processes", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["threads", "processes"]
+)
+def test_a_dask_cluster_builds_the_same(store: UVStore, tmp_path: Path, processes: bool) -> None:
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with (
-        distributed.LocalCluster(processes=False, **options) as cluster,
+        distributed.LocalCluster(processes=processes, **options) as cluster,
         distributed.Client(cluster),
     ):
         build(tmp_path, backend="dask", n_jobs=-1)
@@ -243,6 +249,58 @@ def test_a_killed_run_is_resumed(store: UVStore, tmp_path: Path) -> None:
     for path in tmp_path.glob("shards/.*.tmp"):  # where it was killed while writing
         path.unlink()
     assert content(tmp_path) == content(store.folder)
+
+
+INTERRUPTED = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore it
+from njf_models.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["workers start", "shards are there"])
+def test_an_interrupt_from_the_terminal_is_resumed(tmp_path: Path, moment: str) -> None:
+    """Ctrl-C reaches the workers too: they must not print, and nothing half may stay."""
+    small = ["--csg", "6", "--patches", "4", "--faces", "100", "250", "--energies", "0"]
+    command = ["data", str(tmp_path / "store"), *small]
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED, *command, "--jobs", "2"],
+        cwd=Path(__file__).parents[2],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    shards = tmp_path / "store" / "shards"
+    while not (workers(process.pid) if moment == "workers start" else list(shards.glob("*.safe*"))):
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    error = process.communicate(timeout=120)[1]
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert error.strip().split("\n")[-1] == "njf data: interrupted"
+    assert not list(shards.glob(".*.tmp"))
+    for folder in ("store", "whole"):
+        resumed = ["data", str(tmp_path / folder), *small, "--backend", "sequential"]
+        assert main(resumed) == 0
+    assert content(tmp_path / "store") == content(tmp_path / "whole")
+
+
+def workers(leader: int) -> list[Path]:
+    """Processes of loky in a session whose Python already catches SIGINT, still importing."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            session = int((path / "stat").read_text().rsplit(")", 1)[1].split()[3])
+            caught = int(re.search(r"SigCgt:\s*(\w+)", (path / "status").read_text())[1], 16)
+            loky = b"popen_loky" in (path / "cmdline").read_bytes()
+            if session == leader and loky and caught & 1 << (signal.SIGINT - 1):
+                found.append(path)
+        except OSError:  # it has ended meanwhile
+            continue
+    return found
 
 
 # ------------------------------------------------------- splits

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 import torch
+import trimesh
 
 from njf_models.cli import main
 from njf_models.datasets.store import UVStore
 from njf_models.training import last_checkpoint
 from njf_models.uv_network import UVNetwork
+from tests import meshes
 from tests.njf_models.shapes import bumpy_disk
 
 
@@ -52,6 +55,29 @@ def test_data_and_training_by_their_commands(tmp_path, capsys):
     untrained = UVNetwork(network.arguments, network.inputs).predict(mesh)
     moved = (network.predict(mesh) - untrained).abs().max()
     assert 0 < float(moved) < np.inf
+
+
+def test_data_from_a_cluster_by_its_address(tmp_path, capsys):
+    distributed = pytest.importorskip("distributed")
+    small = ["--csg", "2", "--patches", "1", "--faces", "100", "250", "--energies", "0"]
+    options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(processes=False, **options) as cluster:
+        where = ["--backend", "dask", "--scheduler", cluster.scheduler_address]
+        assert main(["data", str(tmp_path / "there"), *small, *where]) == 0
+    assert main(["data", str(tmp_path / "here"), *small, "--backend", "sequential"]) == 0
+    there, here = (sorted((tmp_path / n / "shards").iterdir()) for n in ("there", "here"))
+    assert [path.read_bytes() for path in there] == [path.read_bytes() for path in here]
+
+
+def test_unreadable_files_are_listed(tmp_path, capsys):
+    trimesh.Trimesh(*meshes.disk(0, 12), process=False).export(tmp_path / "good.ply")
+    (tmp_path / "bad.obj").write_text("f 1 2 3")
+    options = ["--patches", "1", "--faces", "50", "100", "--backend", "sequential"]
+    assert main(["data", str(tmp_path / "out"), "--meshes", str(tmp_path), *options]) == 0
+    said = capsys.readouterr()
+    assert "1 patches of 1 meshes" in said.out
+    (line,) = [line for line in said.err.split("\n") if line.startswith("njf data: ")]
+    assert line.startswith(f"njf data: skipped {tmp_path / 'bad.obj'}: MeshFileError: a face uses")
 
 
 def test_data_without_sources_is_wrong_usage(tmp_path, capsys):

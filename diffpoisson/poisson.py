@@ -92,25 +92,25 @@ class PoissonSolver:
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
-            parts = (divergence[free], L[free][:, pinned])
-            sparse = (SparseMatrix(part, mesh.device) for part in parts)
+            divergence, coupling = (
+                SparseMatrix(matrix, mesh.device)
+                for matrix in (divergence[free], L[free][:, pinned])
+            )
             weights = constraints.mean_weights(mesh._double_vertex_measures)
-            self._assign(mesh, constraints, factor, *sparse, weights)
+            self._assign(mesh, constraints, (factor, divergence, coupling), weights)
             self._require_digits()
 
     def _assign(
         self,
         mesh: Mesh,
         constraints: Constraints,
-        factor: Matrix,
-        divergence: Matrix,
-        coupling: Matrix,
+        matrices: tuple[Matrix, Matrix, Matrix],
         mean_weights: Float[Tensor, "n"] | None,
     ) -> None:
-        """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
+        """Take finished parts: the factor, ∇ᵀA at the free vertices, L between these and pins."""
         self.mesh, self.constraints, self._mean_weights = mesh, constraints, mean_weights
-        self._matrices = (factor, divergence, coupling)
-        self._inverse, self._divergence, self._coupling = map(LinearMap, self._matrices)
+        self._matrices = matrices
+        self._inverse, self._divergence, self._coupling = map(LinearMap, matrices)
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
@@ -181,13 +181,13 @@ class PoissonSolver:
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         concatenate_operators(mesh, [solver.mesh for solver in solvers])
         constraints = Constraints.concatenate([solver.constraints for solver in solvers])
-        matrices = zip(*(solver._matrices for solver in solvers), strict=True)
+        factors, divergences, couplings = zip(*(s._matrices for s in solvers), strict=True)
         weights = [s._mean_weights for s in solvers if s._mean_weights is not None]
         union = object.__new__(cls)
         union._assign(
             mesh,
             constraints,
-            *(BlockDiagonal(blocks) for blocks in matrices),
+            (BlockDiagonal(factors), BlockDiagonal(divergences), BlockDiagonal(couplings)),
             torch.cat(weights) if weights else None,
         )
         return union

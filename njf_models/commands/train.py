@@ -7,8 +7,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from njf_models.commands import UsageError
+
 if TYPE_CHECKING:
     from njf_models.datasets.store import UVStore
+    from njf_models.njf import NeuralJacobianField
 
 _EXAMPLE = """\
 examples:
@@ -36,6 +39,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--minutes", type=float, help="stop after this time, to go on later")
     add("--batch-size", type=int, default=8, metavar="N", help="patches per step (8)")
     add("--rate", type=float, default=1e-3, help="learning rate at the start (1e-3)")
+    add("--init", metavar="WEIGHTS", help="begin with these: a name (uv), .safetensors or .ckpt")
     add("--rounds", type=int, default=2, metavar="N", help="predictions and solves (2; paper 1)")
     add("--shared-rounds", action="store_true", help="one network for all corrections")
     add("--local-step", action="store_true", help="corrections start from closest rotations")
@@ -87,6 +91,8 @@ def run(options: argparse.Namespace) -> int:
         steps=options.steps,
         inputs={"n_points": options.points, "n_energies": train[0].wks.shape[1] * options.wks},
     )
+    if options.init is not None:
+        _begin_with(module.model, _model(options, train[0].wks.shape[1]), options.init)
     trainer = make_trainer(
         options.out,
         minutes=options.minutes,
@@ -101,6 +107,23 @@ def run(options: argparse.Namespace) -> int:
         ckpt_path=last_checkpoint(options.out),
     )
     return 0
+
+
+def _begin_with(model: NeuralJacobianField, arguments: dict[str, Any], weights: str) -> None:
+    """Load weights that are known by name or in a file."""
+    from njf_models.pretrained import load_pretrained  # noqa: PLC0415
+    from njf_models.uv_network import UVNetwork  # noqa: PLC0415
+
+    path = Path(weights)
+    if path.suffix == ".ckpt":
+        network = UVNetwork.from_checkpoint(path)
+    else:
+        network = UVNetwork.load(path) if path.suffix else load_pretrained(weights)
+    if network.arguments != arguments:
+        raise UsageError(
+            f"--init {weights} is of a network with {network.arguments}; ask for these"
+        )
+    model.load_state_dict(network.model.state_dict())
 
 
 def _model(options: argparse.Namespace, n_energies: int) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
         Tutte, "How to draw a graph", 1963. Floater, "Parametrization and smooth approximation of
         surface triangulations", 1997.
     """
-    _require_disk("tutte", mesh)
+    require_disk("tutte", mesh)
     uv = harmonic_disk(mesh)
     if flipped(jacobians(mesh, uv)).any():
         uv = _extended_from_circle(mesh, _graph_laplacian(mesh))
@@ -127,7 +127,7 @@ def slim(
         2017. Jiang, Schaefer and Panozzo, "Simplicial complex augmentation framework for bijective
         maps", 2017.
     """
-    _require_disk("slim", mesh)
+    require_disk("slim", mesh)
     require_number("slim", "tolerance", tolerance)
     require_integer("slim", "max_iterations", max_iterations, least=0)
     _require_init(mesh, init)
@@ -352,7 +352,8 @@ def _require_start(mesh: Mesh, init: Tensor, descent: _Descent) -> None:
         )
 
 
-def _require_disk(operation: str, mesh: Mesh) -> None:
+def require_disk(operation: str, mesh: Mesh, remedy: str = "") -> None:
+    """What every method that flattens one disk requires of it; the remedy ends the message."""
     require_mesh(operation, mesh)
     if mesh.cell_dim != 2:
         raise MeshError(f"{operation}: flattens surfaces, got tetrahedra")
@@ -363,6 +364,7 @@ def _require_disk(operation: str, mesh: Mesh) -> None:
     if not mesh.is_disk:
         raise MeshError(
             f"{operation}: needs a topological disk, but this mesh has {describe_topology(mesh)}"
+            f"{remedy and f'; {remedy}'}"
         )
 
 

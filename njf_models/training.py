@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -170,6 +171,9 @@ class NJFTraining(lightning.LightningModule):
         patience: validations without improvement before the rate falls to a tenth (the paper).
         steps: let the rate fall to zero along a cosine over so many steps instead.
         inputs: fields of `uv_network.Inputs`, what the network sees, for the record.
+
+    Checkpoints record `training_seconds`, wall time over all runs, validations included; None where
+    an earlier run did not record its own.
     """
 
     def __init__(
@@ -187,6 +191,8 @@ class NJFTraining(lightning.LightningModule):
         self.save_hyperparameters()
         self.model = NeuralJacobianField(**model)
         self.learning_rate, self.patience, self.steps = learning_rate, patience, steps
+        self._earlier_seconds: float | None = 0.0
+        self._started: float | None = None
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one packed batch, averaged over the rounds."""
@@ -212,6 +218,29 @@ class NJFTraining(lightning.LightningModule):
 
     def _iterates(self, batch: Batch) -> list[Prediction]:
         return self.model.iterates(batch.shape, self.model.encode(batch.points))
+
+    @property
+    def training_seconds(self) -> float | None:
+        """Wall time of training until now, over all runs; None if some did not record theirs."""
+        if self._earlier_seconds is None or self._started is None:
+            return self._earlier_seconds
+        return self._earlier_seconds + time.perf_counter() - self._started
+
+    def on_train_start(self) -> None:
+        """The clock starts."""
+        self._started = time.perf_counter()
+
+    def on_train_end(self) -> None:
+        """The clock stops."""
+        self._earlier_seconds, self._started = self.training_seconds, None
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Record the time."""
+        checkpoint["training_seconds"] = self.training_seconds
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on counting."""
+        self._earlier_seconds = checkpoint.get("training_seconds")
 
     def configure_optimizers(self) -> Any:
         """Adam and the schedule of its rate."""

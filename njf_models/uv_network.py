@@ -16,8 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import diffpoisson as dp
-from diffpoisson.mesh import require_mesh
-from diffpoisson.parameterization import describe_topology
+from diffpoisson.parameterization import require_disk
 from njf_models.datasets.patches import PatchRejectedError, align, has_pose
 from njf_models.features import Shape, point_features
 from njf_models.njf import NeuralJacobianField
@@ -95,7 +94,7 @@ class UVNetwork:
 
     def prepare(self, mesh: dp.Mesh) -> PreparedDisk:
         """What depends on the mesh alone: pose, factor, features and points."""
-        _require_disk(mesh)
+        require_disk("UVNetwork", mesh, "njf_models.parameterize(mesh, cut=True) cuts it")
         scale = math.sqrt(float(mesh.areas.double().sum()))
         aligned = _aligned(mesh)
         solver = dp.PoissonSolver(aligned)
@@ -154,17 +153,6 @@ class UVNetwork:
         network = cls(dict(trained.hparams["model"]), Inputs(**trained.hparams["inputs"]))
         network.model.load_state_dict(trained.model.state_dict())
         return network
-
-
-def _require_disk(mesh: dp.Mesh) -> None:
-    require_mesh("UVNetwork", mesh)
-    if mesh.dim != 3 or mesh.cell_dim != 2:
-        raise dp.MeshError("UVNetwork: needs triangles in space")
-    if not mesh.is_disk:
-        raise dp.MeshError(
-            f"UVNetwork: needs a topological disk, but this mesh has {describe_topology(mesh)}; "
-            "njf_models.parameterize(mesh, cut=True) cuts it"
-        )
 
 
 def _aligned(mesh: dp.Mesh) -> dp.Mesh:

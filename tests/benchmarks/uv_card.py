@@ -11,6 +11,7 @@ import argparse
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,16 +21,30 @@ from njf_models.uv_network import UVNetwork
 WEIGHTS = Path(__file__).parents[2] / "njf_models" / "weights"
 
 
+def minutes_of_training(checkpoint: dict[str, Any], told: float | None) -> float:
+    """As the checkpoint records them, else as told."""
+    seconds = checkpoint.get("training_seconds")
+    if seconds is not None:
+        return round(seconds / 60, 1)
+    if told is None:
+        raise SystemExit("the checkpoint does not record how long training took: pass --minutes")
+    return told
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("store", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("commands", nargs="+")
-    parser.add_argument("--minutes", type=float, required=True, help="that training took")
+    parser.add_argument(
+        "--minutes", type=float, help="of training, if the checkpoint has no record"
+    )
     parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--max-energy", type=float, default=8.0, help="as training had it")
     options = parser.parse_args()
     checkpoint = options.out / "checkpoints" / "best.ckpt"
+    record = torch.load(checkpoint, map_location="cpu", weights_only=False)
+    minutes = minutes_of_training(record, options.minutes)
     WEIGHTS.mkdir(exist_ok=True)
     network = UVNetwork.from_checkpoint(checkpoint)
     network.save(WEIGHTS / "uv.safetensors")
@@ -49,8 +64,8 @@ def main() -> None:
         "licences of the meshes": ", ".join(f"{n} {name}" for name, n in licences.most_common()),
         "split by mesh family": ", ".join(f"{n} {name}" for name, n in counts.items()),
         "chosen by": "loss on the validation split",
-        "optimiser steps": int(torch.load(checkpoint, weights_only=False)["global_step"]),
-        "minutes of training": options.minutes,
+        "optimiser steps": int(record["global_step"]),
+        "minutes of training": minutes,
         "machine": options.machine,
         "commands": " ; ".join(options.commands),
         "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open have no "

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ from njf_models.training import (
     make_trainer,
 )
 from tests import meshes
+from tests.benchmarks.uv_card import minutes_of_training
 
 MODEL = {"face_features": 6, "point_features": 6, "code_size": 16, "output_dim": 2}
 
@@ -74,6 +76,29 @@ def test_training_learns_and_resumes_where_it_stopped(patches, tmp_path):
     assert resumed.global_step == stopped_at + 2 * 3
     model = load_checkpoint(last)
     assert not model.training
+
+
+def test_training_time_adds_up_over_runs(patches, tmp_path):
+    """Each run's within what the call took; unknown after a checkpoint that has none."""
+    seconds, calls = [0.0], [0.0]
+    for epochs in (2, 4):
+        start = time.perf_counter()
+        _, module = fit(patches, tmp_path, epochs, checkpoint=last_checkpoint(tmp_path))
+        calls.append(time.perf_counter() - start)
+        path = last_checkpoint(tmp_path)
+        assert path is not None
+        saved = torch.load(path, weights_only=False)
+        seconds.append(saved["training_seconds"])
+        assert seconds[-2] < seconds[-1] <= module.training_seconds
+        assert module.training_seconds < sum(calls)
+        assert module.training_seconds == module.training_seconds  # the clock has stopped
+
+    del saved["training_seconds"]
+    torch.save(saved, path)
+    assert not load_checkpoint(path).training
+    _, module = fit(patches, tmp_path, 6, checkpoint=path)
+    assert module.training_seconds is None
+    assert torch.load(path, weights_only=False)["training_seconds"] is None
 
 
 def test_objectives_without_a_target_or_a_loss(patches):
@@ -275,3 +300,10 @@ def test_shape_weights_are_shares_of_each_part(patches):
     ):
         for part in split(weights):
             assert_close(float(part.sum()), 1.0)
+
+
+def test_minutes_on_a_card_are_those_recorded():
+    assert minutes_of_training({"training_seconds": 90.0}, 7.0) == 1.5
+    assert minutes_of_training({"training_seconds": None}, 7.0) == 7.0
+    with pytest.raises(SystemExit, match="pass --minutes"):
+        minutes_of_training({}, None)

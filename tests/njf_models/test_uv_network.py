@@ -76,7 +76,7 @@ def test_other_surfaces_raise_and_name_the_remedy(network, make):
 
 def test_planar_meshes_and_tetrahedra_raise(network):
     for make in (meshes.planar_disk, meshes.box):
-        with pytest.raises(dp.MeshError, match="triangles in space"):
+        with pytest.raises(dp.MeshError, match="UVNetwork: flattens surfaces"):
             network.predict(dp.Mesh(*make(0)))
 
 

@@ -92,30 +92,28 @@ class PoissonSolver:
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
-            parts = (divergence[free], L[free][:, pinned])
-            sparse = (SparseMatrix(part, mesh.device) for part in parts)
+            rows = (divergence[free], L[free][:, pinned])
+            matrices = (factor, *(SparseMatrix(part, mesh.device) for part in rows))
             weights = constraints.mean_weights(mesh._double_vertex_measures)
-            self._assign(mesh, constraints, factor, *sparse, weights)
+            self._assign(mesh, constraints, matrices, weights)
             self._require_digits()
 
     def _assign(
         self,
         mesh: Mesh,
         constraints: Constraints,
-        factor: Matrix,
-        divergence: Matrix,
-        coupling: Matrix,
+        matrices: tuple[Matrix, ...],
         mean_weights: Float[Tensor, "n"] | None,
     ) -> None:
-        """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
+        """Take finished parts: L⁻¹ and ∇ᵀA at the free vertices, and L between these and pins."""
         self.mesh, self.constraints, self._mean_weights = mesh, constraints, mean_weights
-        self._matrices = (factor, divergence, coupling)
-        self._inverse, self._divergence, self._coupling = map(LinearMap, self._matrices)
+        self._matrices = matrices
+        self._inverse, self._divergence, self._coupling = map(LinearMap, matrices)
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
         rows = torch.where(free_index < 0, len(constraints.free), free_index)
-        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
+        self._moving_inverse = CellwiseInverse(matrices[0], rows[mesh.faces])
         # A copy: edited in place, even the mesh's own positions must not pass for the factor's.
         self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
@@ -187,7 +185,7 @@ class PoissonSolver:
         union._assign(
             mesh,
             constraints,
-            *(BlockDiagonal(blocks) for blocks in matrices),
+            tuple(BlockDiagonal(blocks) for blocks in matrices),
             torch.cat(weights) if weights else None,
         )
         return union

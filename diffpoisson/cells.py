@@ -86,19 +86,22 @@ def hat_gradients(corners: Corners, frames: Float[Tensor, "m D d"]) -> Float[Ten
 
 def _edges_at_best_corner(corners: Corners) -> Float[Tensor, "m d D"]:
     """The d edges that leave the corner where the product of their lengths is least, in order."""
-    m, k, _ = corners.shape
+    if corners.shape[1] == 3:  # at a third of the cost: two corners share each edge
+        edges = corners.roll(-1, dims=1) - corners  # from corner i to the next
+        lengths = _norm(edges.detach())
+        best = (lengths * lengths.roll(1, dims=1)).argmin(dim=1)[:, None, None]
+        pair = torch.cat([best, (best + 2) % 3], dim=1).expand(-1, -1, corners.shape[2])
+        onward, back = edges.gather(1, pair).unbind(1)
+        return torch.stack([onward, -back], dim=1)
     edges = corners[:, None, :, :] - corners[:, :, None, :]  # from corner i to corner j
     # The other corners in an order that keeps the orientation.
-    others = torch.tensor(_OTHERS[k], device=corners.device)
-    edges = edges[:, torch.arange(k, device=corners.device)[:, None], others]  # (m, k, d, D)
+    others = torch.tensor(_OTHERS, device=corners.device)
+    edges = edges[:, torch.arange(4, device=corners.device)[:, None], others]  # (m, k, d, D)
     best = _norm(edges.detach()).prod(dim=2).argmin(dim=1)
-    return edges[torch.arange(m, device=corners.device), best]
+    return edges[torch.arange(len(edges), device=corners.device), best]
 
 
-_OTHERS = {
-    3: ((1, 2), (2, 0), (0, 1)),
-    4: ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)),
-}
+_OTHERS = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
 def _determinant(edges: Float[Tensor, "m d D"]) -> Float[Tensor, "m *D"]:
@@ -112,7 +115,7 @@ def _determinant(edges: Float[Tensor, "m d D"]) -> Float[Tensor, "m *D"]:
 
 def _facet_normals(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3"]:
     """Twice the area vector of the facet opposite to each corner, inward if positively oriented."""
-    others = torch.tensor(_OTHERS[4], device=corners.device)
+    others = torch.tensor(_OTHERS, device=corners.device)
     a, b, c = corners[:, others].unbind(2)
     return -torch.linalg.cross(b - a, c - a)
 

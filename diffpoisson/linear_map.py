@@ -46,7 +46,7 @@ class Matrix(ABC):
 
 
 class BlockDiagonal(Matrix):
-    """A block-diagonal matrix, multiplied block by block: a union's, made of its parts'."""
+    """A block-diagonal matrix, multiplied block by block: a union's, of its parts'."""
 
     def __init__(self, blocks: Sequence[Matrix]) -> None:
         self.blocks = blocks

@@ -92,22 +92,20 @@ class PoissonSolver:
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
-            divergence, coupling = (
-                SparseMatrix(matrix, mesh.device)
-                for matrix in (divergence[free], L[free][:, pinned])
-            )
+            rows = (divergence[free], L[free][:, pinned])
+            matrices = (factor, *(SparseMatrix(part, mesh.device) for part in rows))
             weights = constraints.mean_weights(mesh._double_vertex_measures)
-            self._assign(mesh, constraints, (factor, divergence, coupling), weights)
+            self._assign(mesh, constraints, matrices, weights)
             self._require_digits()
 
     def _assign(
         self,
         mesh: Mesh,
         constraints: Constraints,
-        matrices: tuple[Matrix, Matrix, Matrix],
+        matrices: tuple[Matrix, ...],
         mean_weights: Float[Tensor, "n"] | None,
     ) -> None:
-        """Take finished parts: the factor, ∇ᵀA at the free vertices, L between these and pins."""
+        """Take finished parts: L⁻¹ and ∇ᵀA at the free vertices, and L between these and pins."""
         self.mesh, self.constraints, self._mean_weights = mesh, constraints, mean_weights
         self._matrices = matrices
         self._inverse, self._divergence, self._coupling = map(LinearMap, matrices)
@@ -115,7 +113,7 @@ class PoissonSolver:
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
         rows = torch.where(free_index < 0, len(constraints.free), free_index)
-        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
+        self._moving_inverse = CellwiseInverse(matrices[0], rows[mesh.faces])
         # A copy: edited in place, even the mesh's own positions must not pass for the factor's.
         self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
@@ -181,13 +179,13 @@ class PoissonSolver:
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         concatenate_operators(mesh, [solver.mesh for solver in solvers])
         constraints = Constraints.concatenate([solver.constraints for solver in solvers])
-        factors, divergences, couplings = zip(*(s._matrices for s in solvers), strict=True)
+        matrices = zip(*(solver._matrices for solver in solvers), strict=True)
         weights = [s._mean_weights for s in solvers if s._mean_weights is not None]
         union = object.__new__(cls)
         union._assign(
             mesh,
             constraints,
-            (BlockDiagonal(factors), BlockDiagonal(divergences), BlockDiagonal(couplings)),
+            tuple(BlockDiagonal(blocks) for blocks in matrices),
             torch.cat(weights) if weights else None,
         )
         return union

@@ -9,6 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+# A large batch goes through the layers so many rows at a time: in memory that the allocator reuses.
+# Of larger arrays it returns every one to the system, and page faults cost as much as the layers.
+_ROWS = 2048
+
 
 class FieldMLP(nn.Module):
     """Five linear layers, 128 wide, group norms between; the last starts at zero: the identity map.
@@ -59,14 +63,17 @@ class FieldMLP(nn.Module):
         (weight, bias, norm), *others = self._centred_layers()
         of_code, of_features = weight.split((self.code_size, features.shape[-1]), dim=1)
         per_code = functional.linear(code, of_code, bias)
+
+        def outputs(from_code: Tensor, features: Tensor) -> Tensor:
+            x = _scaled_relu(from_code + functional.linear(features, of_features), norm)
+            for weight, bias, scale in others:
+                x = _scaled_relu(functional.linear(x, weight, bias), scale)
+            return self.layers[-1](x)
+
         if part_of_face is None:
-            x = per_code[..., None, :] + functional.linear(features, of_features)
-        else:
-            x = torch.addmm(per_code.index_select(0, part_of_face), features, of_features.T)
-        x = _scaled_relu(x, norm)
-        for weight, bias, norm in others:
-            x = _scaled_relu(functional.linear(x, weight, bias), norm)
-        return self.layers[-1](x)
+            return outputs(per_code[..., None, :], features)
+        pieces = zip(part_of_face.split(_ROWS), features.split(_ROWS), strict=True)
+        return torch.cat([outputs(per_code.index_select(0, part), f) for part, f in pieces])
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""

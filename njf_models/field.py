@@ -72,12 +72,13 @@ class FieldMLP(nn.Module):
 
         if part_of_face is None:
             return outputs(per_code[..., None, :], features)
-        pieces = zip(part_of_face.split(_ROWS), features.split(_ROWS), strict=True)
-        return torch.cat([outputs(per_code.index_select(0, part), f) for part, f in pieces])
+        pieces = [slice(start, start + _ROWS) for start in range(0, len(features), _ROWS)]
+        return torch.cat([outputs(per_code[part_of_face[p]], features[p]) for p in pieces])
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""
-        for linear, norm in zip(self.layers[:-1:3], self.layers[1:-1:3], strict=True):
+        layers = list(self.layers)
+        for linear, norm in zip(layers[:-1:3], layers[1:-1:3], strict=True):
             assert isinstance(linear, nn.Linear)
             assert isinstance(norm, nn.GroupNorm)
             yield _centred(linear.weight, norm), _centred(linear.bias, norm), norm

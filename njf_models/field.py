@@ -77,7 +77,8 @@ class FieldMLP(nn.Module):
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""
-        for linear, norm in zip(self.layers[:-1:3], self.layers[1:-1:3], strict=True):
+        layers = list(self.layers)
+        for linear, norm in zip(layers[:-1:3], layers[1:-1:3], strict=True):
             assert isinstance(linear, nn.Linear)
             assert isinstance(norm, nn.GroupNorm)
             yield _centred(linear.weight, norm), _centred(linear.bias, norm), norm

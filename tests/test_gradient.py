@@ -209,3 +209,17 @@ def test_operators_live_as_long_as_their_mesh():
     del mesh
     gc.collect()
     assert len(_operators) == before - 1
+
+
+@pytest.mark.parametrize("make", [meshes.disk, meshes.torus, meshes.parts])
+def test_a_union_of_solvers_has_the_operators_of_the_same_mesh_assembled_alone(make):
+    parts = [dp.PoissonSolver(dp.Mesh(*make(seed))) for seed in (0, 1)]
+    inner = dp.PoissonSolver.concatenate(parts)
+    union = dp.PoissonSolver.concatenate([parts[1], inner]).mesh
+    ours, alone = (gradient_operator(m) for m in (union, dp.Mesh(union.vertices, union.faces)))
+    for name in ("matrix", "divergence_matrix", "laplacian"):
+        assert abs(getattr(ours, name) - getattr(alone, name)).max() == 0
+    x = torch.randn(union.n_vertices, 2, dtype=torch.float64)
+    y = torch.randn(2 * union.n_faces, 2, dtype=torch.float64)
+    torch.testing.assert_close(ours.gradient(x), alone.gradient(x), rtol=1e-13, atol=1e-13)
+    torch.testing.assert_close(ours.adjoint(y), alone.adjoint(y), rtol=1e-13, atol=1e-13)

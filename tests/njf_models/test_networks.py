@@ -63,11 +63,12 @@ def test_split_first_layer_is_the_plain_network_on_code_and_features():
     assert_close(model(features, codes), expected, rtol=1e-11, atol=1e-11)
 
 
-def test_packed_faces_get_the_code_of_their_part():
+@pytest.mark.parametrize("m", [30, 2048, 5000])
+def test_packed_faces_get_the_code_of_their_part(m):
     model = randomised(FieldMLP(20, 6))
-    features = torch.randn(30, 6, dtype=torch.float64)
+    features = torch.randn(m, 6, dtype=torch.float64)
     codes = torch.randn(3, 20, dtype=torch.float64)
-    part = torch.randint(3, (30,))
+    part = torch.randint(3, (m,))
     expected = plain_field(model)(torch.cat([codes[part], features], dim=1))
     assert_close(model(features, codes, part), expected, rtol=1e-11, atol=1e-11)
 

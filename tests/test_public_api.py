@@ -26,6 +26,7 @@ NAMES = [
     "certify",
     "clamp_flips",
     "clamp_singular_values",
+    "closest_rotation",
     "determinant",
     "divergence",
     "extend",

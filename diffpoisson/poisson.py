@@ -93,31 +93,32 @@ class PoissonSolver:
             divergence, L = _assemble(mesh, constraints)
             factor = _factorised(L[free][:, free], mesh)
             rows = (divergence[free], L[free][:, pinned])
-            matrices = (factor, *(SparseMatrix(part, mesh.device) for part in rows))
-            weights = constraints.mean_weights(mesh._double_vertex_measures)
-            self._assign(mesh, constraints, matrices, weights)
+            matrices = (SparseMatrix(part, mesh.device) for part in rows)
+            self._assign(mesh, constraints, factor, *matrices)
             self._require_digits()
 
     def _assign(
         self,
         mesh: Mesh,
         constraints: Constraints,
-        matrices: tuple[Matrix, ...],
-        mean_weights: Float[Tensor, "n"] | None,
+        factor: Matrix,
+        divergence: Matrix,
+        coupling: Matrix,
     ) -> None:
-        """Take finished parts: L⁻¹ and ∇ᵀA at the free vertices, and L between these and pins."""
-        self.mesh, self.constraints, self._mean_weights = mesh, constraints, mean_weights
-        self._matrices = matrices
-        self._inverse, self._divergence, self._coupling = map(LinearMap, matrices)
+        """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
+        self.mesh, self.constraints = mesh, constraints
+        self._matrices = (factor, divergence, coupling)
+        self._inverse, self._divergence, self._coupling = map(LinearMap, self._matrices)
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
         rows = torch.where(free_index < 0, len(constraints.free), free_index)
-        self._moving_inverse = CellwiseInverse(matrices[0], rows[mesh.faces])
+        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
         # A copy: edited in place, even the mesh's own positions must not pass for the factor's.
         self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
+        self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
 
     @property
     def n_floating(self) -> int:
@@ -180,14 +181,8 @@ class PoissonSolver:
         concatenate_operators(mesh, [solver.mesh for solver in solvers])
         constraints = Constraints.concatenate([solver.constraints for solver in solvers])
         matrices = zip(*(solver._matrices for solver in solvers), strict=True)
-        weights = [s._mean_weights for s in solvers if s._mean_weights is not None]
         union = object.__new__(cls)
-        union._assign(
-            mesh,
-            constraints,
-            tuple(BlockDiagonal(blocks) for blocks in matrices),
-            torch.cat(weights) if weights else None,
-        )
+        union._assign(mesh, constraints, *(BlockDiagonal(blocks) for blocks in matrices))
         return union
 
     def __call__(

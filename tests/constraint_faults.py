@@ -23,7 +23,8 @@ def change_parts(patch, change):
     """Change the coupling to the pins after the factorisation."""
 
     def assign(original, self, *parts):
-        original(self, *parts[:-1], change(parts[-1]))
+        coupling = change(gradient._to_scipy(parts[-1]))
+        original(self, *parts[:-1], gradient.SparseMatrix(coupling, parts[0].device))
 
     wrap_method(patch, Solver, "_assign", assign)
 

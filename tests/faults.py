@@ -103,8 +103,8 @@ def negative_gradient(patch):
 def unweighted_everywhere(patch):
     """Faces of all sizes count alike, in the Laplacian and in the right-hand side."""
 
-    def init(original, self, mesh):
-        original(self, mesh)
+    def init(original, self, *args):
+        original(self, *args)
         self.weights = torch.ones_like(self.weights)
 
     wrap_method(patch, gradient.GradientOperator, "__init__", init)

@@ -125,7 +125,7 @@ def _start_workers(backend: str) -> None:
     The calling process gets it alone, and ends them. Blocked signals are inherited, also by the
     threads that start other processes later.
     """
-    if backend != "loky":
+    if backend != "loky" or not hasattr(signal, "pthread_sigmask"):  # as on Windows
         return
     resource_tracker.ensure_running()  # which unblocks the signal in Python 3.11
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

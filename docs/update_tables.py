@@ -9,10 +9,14 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 
 DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))
+
+from tests.mutation import named, verdicts  # noqa: E402  (found by the line above)
+
 RESULTS = DOCS / "results"
 
 
@@ -84,16 +88,34 @@ def poisson_cost() -> str:
 def mutations() -> str:
     """Mutants of each file: how many there are, how many were run, and what came of them."""
     result = json.loads((RESULTS / "mutations.json").read_text())
-    population = result["population"]
-    counts = Counter((mutant["file"], mutant["outcome"]) for mutant in result["mutants"])
+    argued = verdicts()
+    counts: Counter[tuple[str, str]] = Counter()
+    for mutant in result["mutants"]:
+        outcome = mutant["outcome"]
+        if outcome == "survived" and named(mutant) in argued[mutant["file"]]:
+            outcome = "argued"
+        counts[mutant["file"], outcome] += 1
     rows = []
-    for file, total in population.items():
-        survived = counts[file, "survived"]
+    for file, total in result["population"].items():
         killed = counts[file, "killed"] + counts[file, "hung"]
-        rows.append((f"`{file}.py`", total, killed + survived, killed, survived))
+        left = counts[file, "argued"], counts[file, "survived"]
+        rows.append((f"`{file}.py`", total, killed + sum(left), killed, *left))
     rows.append(("all", *(sum(column) for column in list(zip(*rows, strict=True))[1:])))
-    head = "| file | mutants | run | killed | survived |\n|---|---|---|---|---|"
+    head = "| file | mutants | run | killed | argued below | left |\n|---|---|---|---|---|---|"
     return "\n".join([head, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+
+
+def survivors() -> str:
+    """Each survivor with the reason that it is no fault, and those that have none."""
+    argued = verdicts()
+    groups: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for mutant in json.loads((RESULTS / "mutations.json").read_text())["mutants"]:
+        if mutant["outcome"] == "survived":
+            file = mutant["file"]
+            why = argued[file].get(named(mutant), "**Not argued away.**")
+            groups[file, why].append(f"{mutant['line']} `{mutant['change']}`")
+    lines = [f"- `{file}`, {', '.join(mutants)}. {why}" for (file, why), mutants in groups.items()]
+    return "\n".join(lines)
 
 
 def cli_trial() -> str:
@@ -246,6 +268,7 @@ TABLES = {
     "transforms": transforms,
     "poisson_cost": poisson_cost,
     "mutations": mutations,
+    "survivors": survivors,
 }
 
 

@@ -9,7 +9,8 @@ changed line, first the fastest on each path through the file, until one fails. 
 all pass, or if none fails in `--seconds` of tests. What runs at import (defaults, class bodies,
 constants) can't be exchanged: such mutants are written to a copy of the repository, and the tests
 collected anew. The same command goes on where it was interrupted; mutants of a file that has
-changed since are forgotten. `--again` runs the survivors again, after tests were added.
+changed since are forgotten. `--again` runs the survivors again, after tests were added, but for
+those that `mutation_verdicts.toml` argues away.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import signal
 import sys
 import tempfile
 import time
+import tomllib
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -42,7 +44,16 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted(p.stem for p in (ROOT / "diffpoisson").glob("[!_]*.py") if p.stem != "testing")
 # These start processes, which do not see the exchanged code, or take minutes.
-LEFT_OUT = ("test_examples", "test_faults", "test_fuzz", "test_public_api", "test_robustness")
+LEFT_OUT = (
+    "test_examples",
+    "test_faults",
+    "test_fuzz",
+    "test_mutation",
+    "test_public_api",
+    "test_robustness",
+)
+VERDICTS = Path(__file__).parent / "mutation_verdicts.toml"
+MOVES = ("cpu", "numpy")  # without them nothing changes where all tensors live on the CPU
 UNEXPECTED = 99
 PROBE = "_probe_of_the_mutation_tests"
 
@@ -87,6 +98,20 @@ class Mutant:
     @property
     def key(self) -> tuple[str, int, int, str]:
         return self.file, self.line, self.column, self.change
+
+
+def verdicts() -> dict[str, dict[str, str]]:
+    """Why survivors are no faults, for each file by mutant as `named` writes it."""
+    argued: dict[str, dict[str, str]] = defaultdict(dict)
+    for group in tomllib.loads(VERDICTS.read_text())["group"]:
+        for name in group["mutants"]:
+            argued[group["file"]][name] = group["why"]
+    return argued
+
+
+def named(record: dict[str, Any]) -> str:
+    """A mutant of a report, by what it says and not by its line, which moves."""
+    return f"{record['change']}  in  {record['statement']}"
 
 
 def mutants(file: str, text: str) -> Iterator[Mutant]:
@@ -164,7 +189,7 @@ def _changes(node: Any) -> Iterator[tuple[str, Callable[[], None]]]:
     elif (
         isinstance(node, ast.Call)
         and isinstance(node.func, ast.Attribute)
-        and not (node.args or node.keywords)
+        and not (node.args or node.keywords or node.func.attr in MOVES)
     ):  # x.contiguous() and the like
         yield f"{_short(node)} without the call", swap(node, "func", _identity(node.func))
 
@@ -357,11 +382,13 @@ class Run:
     def __init__(self, copy: Path, files: list[str], seconds: float, state: Path) -> None:
         self.copy, self.seconds, self.state = copy, seconds, state
         self.package = copy / "diffpoisson"
-        self.texts = {file: (self.package / f"{file}.py").read_text() for file in files}
+        self.texts = {file: (self.package / f"{file}.py").read_text() for file in FILES}
         self.hashes = {file: _hash(text) for file, text in self.texts.items()}
-        self.all = [m for file, text in self.texts.items() for m in mutants(file, text)]
+        everything = [m for file, text in self.texts.items() for m in mutants(file, text)]
+        self.all = [mutant for mutant in everything if mutant.file in files]
+        self.existing = {mutant.key for mutant in everything}
+        self.population = Counter(mutant.file for mutant in everything)
         self.done: dict[tuple[str, int, int, str], dict[str, Any]] = {}
-        self.population = {file: sum(m.file == file for m in self.all) for file in files}
         self.load()
 
     def load(self) -> None:
@@ -369,19 +396,20 @@ class Run:
         if not self.state.exists():
             return
         earlier = json.loads(self.state.read_text())
-        current = {
-            file: _hash(path.read_text())
-            for file in earlier["sources"]
-            if (path := self.package / f"{file}.py").exists()
-        }
-        fresh = {f for f, value in earlier["sources"].items() if current.get(f) == value}
-        self.population = {f: earlier["population"][f] for f in fresh} | self.population
-        self.hashes = {f: earlier["sources"][f] for f in fresh} | self.hashes
-        records = [r for r in earlier["mutants"] if r["file"] in fresh]
-        self.done = {(r["file"], r["line"], r["column"], r["change"]): r for r in records}
+        for record in earlier["mutants"]:
+            file = record["file"]
+            key = file, record["line"], record["column"], record["change"]
+            if key in self.existing and earlier["sources"][file] == self.hashes[file]:
+                self.done[key] = record
 
     def forget_survivors(self) -> None:
-        self.done = {k: r for k, r in self.done.items() if r["outcome"] != "survived"}
+        """But for those that are argued away."""
+        argued = verdicts()
+        self.done = {
+            key: record
+            for key, record in self.done.items()
+            if record["outcome"] != "survived" or named(record) in argued[record["file"]]
+        }
 
     def todo(self) -> list[Mutant]:
         return [mutant for mutant in self.all if mutant.key not in self.done]

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from diffpoisson.linear_map import Matrix
 
-_MAX_COLUMNS = {"cuda": 128}  # cholespy's limits for one call
+# Of one call: cholespy's limit on CUDA; CHOLMOD solves four columns at a time, and is slower, never
+# faster, with the many of which the work space outgrows the cache.
+_COLUMNS = {"cuda": 128, "cpu": 8}
 
 
 class CholeskyFactor(Matrix):
@@ -68,7 +70,9 @@ class CholeskyFactor(Matrix):
             )
         if x.device != self._device:
             raise ValueError(f"CholeskyFactor: x is on {x.device}, the factor on {self._device}")
-        width = _MAX_COLUMNS.get(x.device.type, max(x.shape[1], 1))
+        width = _COLUMNS[x.device.type]
+        if x.shape[1] <= width:
+            return self._solve(x).to(x.dtype)
         return torch.cat([self._solve(chunk) for chunk in x.split(width, dim=1)], dim=1).to(x.dtype)
 
     def _solve(self, b: Tensor) -> Tensor:

@@ -42,7 +42,9 @@ class SparseMatrix(Matrix):
         """A x."""
         # Autocast would round geometry to half precision behind the caller's back.
         with torch.autocast(x.device.type, enabled=False):
-            return self._in(x.dtype) @ x
+            # As A @ x, which would clear the memory of y first, and copy it once more.
+            y = x.new_empty(self.shape[0], x.shape[1])
+            return torch.addmm(y, self._in(x.dtype), x, beta=0, out=y)
 
     def transposed(self) -> SparseMatrix:
         """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""
@@ -82,36 +84,44 @@ def _to_torch(matrix: sp.csr_matrix, dtype: torch.dtype, device: torch.device) -
         )
 
 
-def _to_scipy(matrix: Matrix) -> sp.csr_matrix:
-    if isinstance(matrix, BlockDiagonal):
-        return sp.block_diag([_to_scipy(block) for block in matrix.blocks], format="csr")
-    assert isinstance(matrix, SparseMatrix)
-    return matrix.scipy
+def _to_scipy(gradient: Matrix) -> sp.csr_matrix:
+    if isinstance(gradient, BlockDiagonal):
+        d = gradient.planes[0]
+        planes = zip(*(_planes(_to_scipy(block), d) for block in gradient.blocks), strict=True)
+        return sp.vstack([sp.block_diag(plane) for plane in planes], format="csr")
+    assert isinstance(gradient, SparseMatrix)
+    return gradient.scipy
+
+
+def _planes(matrix: sp.csr_matrix, d: int) -> list[sp.csr_matrix]:
+    """The rows of each direction."""
+    m = matrix.shape[0] // d
+    return [matrix[i * m : (i + 1) * m] for i in range(d)]
 
 
 class GradientOperator:
     """∇ of one mesh and what is made of it, assembled once; see `gradient_operator`.
 
     Attributes:
-        gradient: ∇ as a differentiable map, (n, ·) to (m·d, ·).
-        adjoint: ∇ᵀ as a differentiable map, (m·d, ·) to (n, ·).
-        weights: (m·d, 1) float64 measure of the cell of each row: the diagonal of A.
+        gradient: ∇ as a differentiable map, (n, ·) to (d·m, ·).
+        adjoint: ∇ᵀ as a differentiable map, (d·m, ·) to (n, ·).
+        weights: (d·m, 1) float64 measure of the cell of each row: the diagonal of A.
     """
 
     def __init__(self, mesh: Mesh, gradient: SparseMatrix | BlockDiagonal) -> None:
         self._gradient = gradient
         self.gradient = LinearMap(gradient)
         self.adjoint = self.gradient.T
-        self.weights = mesh._double_measures.repeat_interleave(mesh.cell_dim)[:, None]
+        self.weights = mesh._double_measures.repeat(mesh.cell_dim)[:, None]
 
     @constant_property
     def matrix(self) -> sp.csr_matrix:
-        """∇ as a SciPy matrix (m·d, n), float64; row d·j + i is direction i on face j."""
+        """∇ as a SciPy matrix (d·m, n), float64; row m·i + j is direction i on face j."""
         return _to_scipy(self._gradient)
 
     @constant_property
     def divergence_matrix(self) -> sp.csr_matrix:
-        """∇ᵀA as a SciPy matrix (n, m·d)."""
+        """∇ᵀA as a SciPy matrix (n, d·m)."""
         weights = self.weights[:, 0].cpu().numpy()
         return (sp.diags(weights) @ self.matrix).T.tocsr()
 
@@ -143,7 +153,7 @@ def concatenate_operators(union: Mesh, parts: Sequence[Mesh]) -> None:
     """Keep for the disjoint union of meshes what was assembled for them."""
     blocks = [gradient_operator(part)._gradient for part in parts]
     with outside_transforms():
-        _operators[union] = GradientOperator(union, BlockDiagonal(blocks))
+        _operators[union] = GradientOperator(union, BlockDiagonal(blocks, (union.cell_dim, 1)))
 
 
 def jacobians(
@@ -326,19 +336,19 @@ def columns_to_vertices(
 
 
 def matrices_to_columns(R: Float[Tensor, "*batch m c d"]) -> Float[Tensor, "rows k"]:
-    """(…, m, c, d) to (m·d, …·c), row d·j + i is direction i on face j."""
+    """(…, m, c, d) to (d·m, …·c), row m·i + j is direction i on face j."""
     m, d = R.shape[-3], R.shape[-1]
-    return R.movedim((-3, -1), (0, 1)).reshape(m * d, math.prod(R.shape[:-3]) * R.shape[-2])
+    return R.movedim((-1, -3), (0, 1)).reshape(d * m, math.prod(R.shape[:-3]) * R.shape[-2])
 
 
 def columns_to_matrices(
     columns: Float[Tensor, "rows k"], shape: torch.Size, d: int
 ) -> Float[Tensor, "*batch m c d"]:
-    """(m·d, …·c) back to (…, m, c, d), given the shape (…, n, c) of the map it came from."""
+    """(d·m, …·c) back to (…, m, c, d), given the shape (…, n, c) of the map it came from."""
     return (
         columns.unflatten(1, (*shape[:-2], shape[-1]))
-        .unflatten(0, (-1, d))
-        .movedim((0, 1), (-3, -1))
+        .unflatten(0, (d, -1))
+        .movedim((0, 1), (-1, -3))
     )
 
 
@@ -346,10 +356,11 @@ def columns_to_matrices(
 
 
 def _gradient_matrix(mesh: Mesh) -> sp.csr_matrix:
-    """∇ as (m·d, n): row d·j + i holds component i of the hat gradients of face j."""
+    """∇ as (d·m, n): row m·i + j holds component i of the hat gradients of face j."""
     d, k = mesh.cell_dim, mesh.cell_dim + 1
-    values = cells.hat_gradients(mesh._corners, mesh._double_frames).cpu().numpy()  # (m, d, k)
-    columns = mesh.faces.cpu().numpy().repeat(d, axis=0)
+    hats = cells.hat_gradients(mesh._corners, mesh._double_frames)  # (m, d, k)
+    values = hats.movedim(1, 0).cpu().numpy()
+    columns = np.tile(mesh.faces.cpu().numpy(), (d, 1))
     rows = np.arange(0, values.size + 1, k)
     shape = (d * mesh.n_faces, mesh.n_vertices)
     matrix = sp.csr_matrix((values.ravel(), columns.ravel(), rows), shape=shape)

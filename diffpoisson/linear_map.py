@@ -46,21 +46,53 @@ class Matrix(ABC):
 
 
 class BlockDiagonal(Matrix):
-    """A block-diagonal matrix, multiplied block by block: a union's, of its parts'."""
+    """A block-diagonal matrix, multiplied block by block: a union's, of its parts'.
 
-    def __init__(self, blocks: Sequence[Matrix]) -> None:
-        self.blocks = blocks
-        self._columns = [block.shape[1] for block in blocks]
-        self.shape = (sum(block.shape[0] for block in blocks), sum(self._columns))
+    Args:
+        blocks: the matrices of the parts.
+        planes: rows and columns may come in several planes, each of which holds its part of every
+            block: (2, 1) for a gradient, whose rows are those of all faces in the first direction,
+            then those in the second.
+    """
+
+    def __init__(self, blocks: Sequence[Matrix], planes: tuple[int, int] = (1, 1)) -> None:
+        self.blocks, self.planes = blocks, planes
+        self._columns = [block.shape[1] // planes[1] for block in blocks]
+        rows, columns = zip(*(block.shape for block in blocks), strict=True)
+        self.shape = (sum(rows), sum(columns))
 
     def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
         """A x."""
-        pieces = x.split(self._columns)
-        return torch.cat([A.multiply(piece) for A, piece in zip(self.blocks, pieces, strict=True)])
+        rows, columns = self.planes
+        pieces = x.unflatten(0, (columns, -1)).split(self._columns, dim=1)
+        products = [
+            A.multiply(piece.flatten(0, 1)).unflatten(0, (rows, -1))
+            for A, piece in zip(self.blocks, pieces, strict=True)
+        ]
+        return torch.cat(products, dim=1).flatten(0, 1)
 
     def transposed(self) -> BlockDiagonal:
         """Aᵀ."""
-        return BlockDiagonal([block.transposed() for block in self.blocks])
+        return BlockDiagonal([block.transposed() for block in self.blocks], self.planes[::-1])
+
+
+class Product(Matrix):
+    """A₁ A₂ ⋯, applied from the right and never formed; in float64 inside."""
+
+    def __init__(self, factors: Sequence[Matrix]) -> None:
+        self.factors = factors
+        self.shape = (factors[0].shape[0], factors[-1].shape[1])
+
+    def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
+        """A₁ A₂ ⋯ x."""
+        y = x.double()
+        for A in reversed(self.factors):
+            y = A.multiply(y)
+        return y.to(x.dtype)
+
+    def transposed(self) -> Product:
+        """⋯ A₂ᵀ A₁ᵀ."""
+        return Product([A.transposed() for A in reversed(self.factors)])
 
 
 class _Handle(OpaqueBase):

@@ -307,7 +307,7 @@ def _mean_energy(mesh: Mesh) -> Callable[[Float[np.ndarray, "n 2"]], float]:
     weights = (mesh._double_measures / mesh._double_measures.sum()).cpu().numpy()
 
     def energy(points: np.ndarray) -> float:
-        u, v = (gradient @ points).T.reshape(2, -1, 2)  # rows of the Jacobians
+        u, v = (gradient @ points).reshape(2, -1, 2)  # columns of the Jacobians
         det = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
         if not (det > 0).all():
             return math.inf

@@ -16,7 +16,7 @@ right-hand side: each derivative is one more solve with the factor, exact to any
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -38,9 +38,44 @@ from diffpoisson.gradient import (
     matrices_to_columns,
     vertices_to_columns,
 )
-from diffpoisson.linear_map import BlockDiagonal, CellwiseInverse, LinearMap, Matrix
+from diffpoisson.linear_map import BlockDiagonal, CellwiseInverse, LinearMap, Matrix, Product
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
+from diffpoisson.placement import Placement
 from diffpoisson.transforms import outside_transforms, require_equal
+
+
+class _Matrices(NamedTuple):
+    """What leads from a Jacobian field to a map.
+
+    Attributes:
+        inverse: L⁻¹ at the free vertices.
+        divergence: ∇ᵀA at the free vertices.
+        coupling: L between the free vertices and the pins.
+        place: from values at the free vertices to a map, where the gauge wants it.
+        fit: place · inverse · divergence, all there is to do without pins and handles.
+    """
+
+    inverse: Matrix
+    divergence: Matrix
+    coupling: Matrix
+    place: Matrix
+    fit: Matrix
+
+    @classmethod
+    def of(cls, inverse: Matrix, divergence: Matrix, coupling: Matrix, place: Matrix) -> _Matrices:
+        return cls(inverse, divergence, coupling, place, Product([place, inverse, divergence]))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[_Matrices], d: int) -> _Matrices:
+        """Those of a disjoint union; the rows of a field come in d planes."""
+        inverses, divergences, couplings, places, fits = zip(*parts, strict=True)
+        return cls(
+            BlockDiagonal(inverses),
+            BlockDiagonal(divergences, (1, d)),
+            BlockDiagonal(couplings),
+            BlockDiagonal(places),
+            BlockDiagonal(fits, (1, d)),
+        )
 
 
 class PoissonSolver:
@@ -91,34 +126,32 @@ class PoissonSolver:
             )
             free, pinned = (i.cpu().numpy() for i in (constraints.free, constraints.pins))
             divergence, L = _assemble(mesh, constraints)
-            factor = _factorised(L[free][:, free], mesh)
-            rows = (divergence[free], L[free][:, pinned])
-            matrices = (SparseMatrix(part, mesh.device) for part in rows)
-            self._assign(mesh, constraints, factor, *matrices)
+            matrices = _Matrices.of(
+                _factorised(L[free][:, free], mesh),
+                SparseMatrix(divergence[free], mesh.device),
+                SparseMatrix(L[free][:, pinned], mesh.device),
+                Placement(constraints, constraints.mean_weights(mesh._double_vertex_measures)),
+            )
+            self._assign(mesh, constraints, matrices)
             self._require_digits()
 
-    def _assign(
-        self,
-        mesh: Mesh,
-        constraints: Constraints,
-        factor: Matrix,
-        divergence: Matrix,
-        coupling: Matrix,
-    ) -> None:
-        """Take finished parts: ∇ᵀA at the free vertices, and L between these and the pins."""
-        self.mesh, self.constraints = mesh, constraints
-        self._matrices = (factor, divergence, coupling)
-        self._inverse, self._divergence, self._coupling = map(LinearMap, self._matrices)
+    def _assign(self, mesh: Mesh, constraints: Constraints, matrices: _Matrices) -> None:
+        """Take finished parts."""
+        self.mesh, self.constraints, self._matrices = mesh, constraints, matrices
+        self._inverse = LinearMap(matrices.inverse)
+        self._divergence = LinearMap(matrices.divergence)
+        self._coupling = LinearMap(matrices.coupling)
+        self._place = LinearMap(matrices.place)
+        self._fit = LinearMap(matrices.fit)
         free_index = torch.full((mesh.n_vertices,), -1, device=mesh.device)
         free_index[constraints.free] = torch.arange(len(constraints.free), device=mesh.device)
         self._handle_rows = free_index[constraints.handles]
         rows = torch.where(free_index < 0, len(constraints.free), free_index)
-        self._moving_inverse = CellwiseInverse(factor, rows[mesh.faces])
+        self._moving_inverse = CellwiseInverse(matrices.inverse, rows[mesh.faces])
         # A copy: edited in place, even the mesh's own positions must not pass for the factor's.
         self._vertices = mesh.vertices.to(torch.float64, copy=True)
         # Made here, not at first use: torch.compile cannot trace what fills a cache.
         self._frames = mesh._double_frames
-        self._mean_weights = constraints.mean_weights(mesh._double_vertex_measures)
 
     @property
     def n_floating(self) -> int:
@@ -180,9 +213,9 @@ class PoissonSolver:
         mesh = Mesh.concatenate([solver.mesh for solver in solvers])
         concatenate_operators(mesh, [solver.mesh for solver in solvers])
         constraints = Constraints.concatenate([solver.constraints for solver in solvers])
-        matrices = zip(*(solver._matrices for solver in solvers), strict=True)
+        matrices = _Matrices.concatenate([solver._matrices for solver in solvers], mesh.cell_dim)
         union = object.__new__(cls)
-        union._assign(mesh, constraints, *(BlockDiagonal(blocks) for blocks in matrices))
+        union._assign(mesh, constraints, matrices)
         return union
 
     def __call__(
@@ -234,7 +267,6 @@ class PoissonSolver:
         if pull is not None:
             pull = self.constraints.handle_weights[:, None] * pull
 
-        means = self._mean_weights
         if geometry is None:
             phi = self._fitted(fields, q_pins, pull)
             for _ in range(refinements):
@@ -246,8 +278,10 @@ class PoissonSolver:
             )
         else:
             phi = self._fitted_moving(geometry, face_weights, fields, q_pins, pull)
-            means = self.constraints.mean_weights(geometry.vertex_measures())
-        phi = self._placed(phi, means, translations, batch, c)
+        if translations is not None:
+            phi = phi + self._at_components(
+                self._columns("translations", translations, self.n_floating, batch, c)
+            )
         return columns_to_vertices(phi, fields.shape).to(R.dtype)
 
     def solve_laplacian(self, b: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -283,13 +317,17 @@ class PoissonSolver:
         q_pins: Float[Tensor, "p k"] | None,
         pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "n k"]:
-        """The solution before its floating components are placed."""
-        b = self._divergence(matrices_to_columns(fields))
+        """The solution, its floating components placed by the gauge."""
+        columns = matrices_to_columns(fields)
+        if q_pins is None and pull is None:
+            return self._fit(columns)  # the steps below as one
+        b = self._divergence(columns)
         if q_pins is not None:
             b = b - self._coupling(q_pins)
         if pull is not None:
             b = b.index_add(0, self._handle_rows, pull)
-        return self._scattered(self._inverse(b), q_pins)
+        phi = self._place(self._inverse(b))
+        return phi if q_pins is None else phi.index_copy(0, self.constraints.pins, q_pins)
 
     def _given(
         self, name: str, values: Tensor | None, count: int, batch: torch.Size, c: int
@@ -312,7 +350,7 @@ class PoissonSolver:
         R: Float[Tensor, "*batch m c d"],
         pull: Float[Tensor, "h k"] | None,
     ) -> Float[Tensor, "n k"]:
-        """Φ + L⁻¹ (∇ᵀA (R - ∇Φ) + W (q - Φ)).
+        """Φ + L⁻¹ (∇ᵀA (R - ∇Φ) + W (q - Φ)), placed by the gauge as Φ is.
 
         The misfit of the gradient, unlike b - L Φ, is small where the solution is good: thin faces
         do not cancel its digits.
@@ -323,35 +361,16 @@ class PoissonSolver:
         if pull is not None:
             held = constraints.handle_weights[:, None] * phi[constraints.handles]
             b = b.index_add(0, self._handle_rows, pull - held)
-        return phi.index_add(0, constraints.free, self._inverse(b))
+        return phi + self._place(self._inverse(b))
 
-    def _scattered(
-        self, x: Float[Tensor, "f k"], q_pins: Float[Tensor, "p k"] | None = None
-    ) -> Float[Tensor, "n k"]:
-        """Values at the free vertices and, if given, at the pins; zero elsewhere."""
-        phi = x.new_zeros(self.mesh.n_vertices, x.shape[1])
-        phi = phi.index_copy(0, self.constraints.free, x)
-        return phi if q_pins is None else phi.index_copy(0, self.constraints.pins, q_pins)
+    def _scattered(self, x: Float[Tensor, "f k"]) -> Float[Tensor, "n k"]:
+        """Values at the free vertices; zero elsewhere."""
+        return x.new_zeros(self.mesh.n_vertices, x.shape[1]).index_copy(0, self.constraints.free, x)
 
-    def _placed(
-        self,
-        phi: Float[Tensor, "n k"],
-        means: Float[Tensor, "n"] | None,
-        translations: Tensor | None,
-        batch: torch.Size,
-        c: int,
-    ) -> Float[Tensor, "n k"]:
-        """Move each floating component to where its gauge wants it."""
-        constraints = self.constraints
-        shifts = phi.new_zeros(constraints.n_floating + 1, phi.shape[1])
-        if means is not None:
-            shifts = shifts.index_add(0, constraints.floating, -means[:, None] * phi)
-        shifts = shifts[:-1]
-        if translations is not None:
-            shifts = shifts + self._columns("translations", translations, self.n_floating, batch, c)
-        # What is held stays where it is, and catches no NaN, times zero, from other components.
-        shifts = torch.cat([shifts, shifts.new_zeros(1, shifts.shape[1])])
-        return phi + shifts.index_select(0, constraints.floating)
+    def _at_components(self, values: Float[Tensor, "q k"]) -> Float[Tensor, "n k"]:
+        """The value of each floating component at its vertices, and zero at what is held."""
+        values = torch.cat([values, values.new_zeros(1, values.shape[1])])
+        return values.index_select(0, self.constraints.floating)
 
     # ---------------------------------------------------------------- derivatives by the geometry
 
@@ -392,8 +411,18 @@ class PoissonSolver:
         b = vertices_to_columns(geometry.divergence(fields, weights))
         if pull is not None:
             b = b.index_add(0, constraints.handles, pull)
-        x = self._moving_inverse(geometry.stiffness(weights), b[constraints.free])
-        return self._scattered(x, q_pins)
+        phi = self._scattered(
+            self._moving_inverse(geometry.stiffness(weights), b[constraints.free])
+        )
+        if q_pins is not None:
+            phi = phi.index_copy(0, constraints.pins, q_pins)
+        means = constraints.mean_weights(geometry.vertex_measures())
+        if means is None:
+            return phi
+        sums = phi.new_zeros(self.n_floating + 1, phi.shape[1])
+        sums = sums.index_add(0, constraints.floating, means[:, None] * phi)
+        # What is held stays where it is, and catches no NaN, times zero, from other components.
+        return phi - self._at_components(sums[:-1])
 
     def __repr__(self) -> str:
         constraints = self.constraints
@@ -469,7 +498,7 @@ def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.c
     divergence = operator.divergence_matrix
     weights = constraints.face_weights.cpu().numpy()
     if (weights != 1).any():
-        divergence = (divergence @ sp.diags(weights.repeat(mesh.cell_dim))).tocsr()
+        divergence = (divergence @ sp.diags(np.tile(weights, mesh.cell_dim))).tocsr()
     L = divergence @ operator.matrix
     strengths = np.zeros(mesh.n_vertices)
     strengths[constraints.handles.cpu().numpy()] = constraints.handle_weights.cpu().numpy()

@@ -10,7 +10,16 @@ import dataclasses
 import scipy.sparse as sp
 import torch
 
-from diffpoisson import cells, constraints, distortion, factor, gradient, linear_map, poisson
+from diffpoisson import (
+    cells,
+    constraints,
+    distortion,
+    factor,
+    gradient,
+    linear_map,
+    placement,
+    poisson,
+)
 from tests.faults import Fault, change_system, registrar, wrap, wrap_method
 
 FAULTS: dict[str, Fault] = {}
@@ -22,9 +31,9 @@ Solver = poisson.PoissonSolver
 def change_parts(patch, change):
     """Change the coupling to the pins after the factorisation."""
 
-    def assign(original, self, *parts):
-        coupling = change(gradient._to_scipy(parts[-1]))
-        original(self, *parts[:-1], gradient.SparseMatrix(coupling, parts[0].device))
+    def assign(original, self, mesh, given, matrices):
+        coupling = gradient.SparseMatrix(change(matrices.coupling.scipy), mesh.device)
+        original(self, mesh, given, matrices._replace(coupling=coupling))
 
     wrap_method(patch, Solver, "_assign", assign)
 
@@ -86,14 +95,13 @@ def sorted_pins(patch):
 def gauge_moves_what_is_held(patch):
     """The mean is subtracted from held components too."""
 
-    def place(original, solver, phi, *rest):
-        phi = original(solver, phi, *rest)
-        if len(solver.constraints.pins) or not len(solver.constraints.handles):
+    def place(original, self, x):
+        phi = original(self, x)
+        if len(self.constraints.pins) or not len(self.constraints.handles):
             return phi
-        sizes = solver.mesh._double_vertex_measures[:, None]
-        return phi - (sizes * phi).sum(0) / sizes.sum()
+        return phi - phi.mean(0)
 
-    wrap_method(patch, Solver, "_placed", place)
+    wrap_method(patch, placement.Placement, "multiply", place)
 
 
 @fault("handles")
@@ -150,10 +158,11 @@ def shared_weights(patch):
 def face_weights_in_the_gauge(patch):
     """The gauge's mean is weighted by the faces' weights too."""
 
-    def assign(original, self, mesh, given, *rest):
-        original(self, mesh, given, *rest)
+    def assign(original, self, mesh, given, matrices):
         shares = mesh._double_measures * given.face_weights
-        self._mean_weights = given.mean_weights(mesh.sum_at_vertices(shares[:, None])[:, 0])
+        sizes = mesh.sum_at_vertices(shares[:, None])[:, 0]
+        place = placement.Placement(given, given.mean_weights(sizes))
+        original(self, mesh, given, type(matrices).of(*matrices[:3], place))
 
     wrap_method(patch, Solver, "_assign", assign)
 
@@ -211,10 +220,10 @@ def translations_in_reverse(patch):
 def translations_by_mean_only(patch):
     """Translations are forgotten under the gauge that fixes a vertex."""
 
-    def place(original, self, phi, means, translations, *rest):
-        return original(self, phi, means, None if means is None else translations, *rest)
+    def place(original, self, values):
+        return original(self, 0 * values if self.constraints.gauge_mask is None else values)
 
-    wrap_method(patch, Solver, "_placed", place)
+    wrap_method(patch, Solver, "_at_components", place)
 
 
 # ------------------------------------------------------- unions, updates, wide batches
@@ -256,7 +265,9 @@ def factor_survives_an_update(patch):
 
     def update(original, self, vertices):
         moved = original(self, vertices)
-        moved._inverse = self._inverse
+        matrices = moved._matrices
+        old = type(matrices).of(self._matrices.inverse, *matrices[1:4])
+        moved._assign(moved.mesh, moved.constraints, old)
         return moved
 
     wrap_method(patch, Solver, "update", update)
@@ -284,7 +295,7 @@ def only_the_first_chunk(patch):
 
     def multiply(original, self, x):
         result = original(self, x)
-        result[:, factor._MAX_COLUMNS.get("cpu", result.shape[1]) :] = 0
+        result[:, factor._COLUMNS["cpu"] :] = 0
         return result
 
     wrap_method(patch, factor.CholeskyFactor, "multiply", multiply)

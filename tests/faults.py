@@ -17,7 +17,7 @@ import scipy.sparse as sp
 import torch
 from torch import Tensor
 
-from diffpoisson import cells, constraints, gradient, linear_map, mesh, poisson
+from diffpoisson import cells, constraints, gradient, linear_map, mesh, placement, poisson
 
 Patch = pytest.MonkeyPatch
 
@@ -250,29 +250,31 @@ def plain_mean(patch):
 def global_mean(patch):
     """One mean over all components."""
 
-    def place(_, solver, phi, *rest):
-        areas = solver.mesh.vertex_areas[:, None]
-        return phi - (areas * phi).sum(0) / areas.sum()
+    def place(_, self, x):
+        phi = x.new_zeros(self.shape[0], x.shape[1])
+        phi[self.constraints.free] = x
+        return phi - (self.means[:, None] * phi).sum(0) / self.means.sum()
 
-    wrap_method(patch, poisson.PoissonSolver, "_placed", place)
+    wrap_method(patch, placement.Placement, "multiply", place)
 
 
 @fault("mean_gauge")
 def first_vertex_at_zero(patch):
     """The mean gauge is left out: the first vertex is at zero instead."""
     wrap_method(
-        patch, poisson.PoissonSolver, "_placed", lambda _, solver, phi, *rest: phi - phi[:1]
+        patch, placement.Placement, "multiply", lambda f, self, x: (y := f(self, x)) - y[:1]
     )
 
 
 @fault("backward")
 def detached_gauge(patch):
-    """The mean is subtracted as a constant, outside the graph."""
-
-    def place(original, solver, phi, *rest):
-        return phi + (original(solver, phi, *rest) - phi).detach()
-
-    wrap_method(patch, poisson.PoissonSolver, "_placed", place)
+    """The mean is subtracted as a constant, which the adjoint knows nothing of."""
+    wrap_method(
+        patch,
+        placement.PlacementTransposed,
+        "multiply",
+        lambda _, self, x: x[self.transposed().constraints.free],
+    )
 
 
 @fault("disconnected_as_each_alone")
@@ -323,9 +325,9 @@ def stale_operator(patch):
 def one_factor_for_all_parts(patch):
     """A batch reuses the first factor where sizes agree."""
 
-    def first(original, blocks):
+    def first(original, blocks, *planes):
         same = {block.shape: block for block in reversed(blocks)}
-        return original([same[block.shape] for block in blocks])
+        return original([same[block.shape] for block in blocks], *planes)
 
     wrap(patch, poisson, "BlockDiagonal", first)
 

@@ -332,6 +332,12 @@ def one_factor_for_all_parts(patch):
     wrap(patch, poisson, "BlockDiagonal", first)
 
 
+@fault("concatenated_as_each_alone")
+def planes_run_together(patch):
+    """A batch reads its field face by face, not direction by direction."""
+    wrap(patch, poisson, "BlockDiagonal", lambda f, blocks, *planes: f(blocks))
+
+
 @fault("input_is_untouched")
 def mutated_input(patch):
     """The caller's tensor is scaled in place, by a rounding or so."""

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import SparseMatrix
-from diffpoisson.linear_map import BlockDiagonal
+from diffpoisson.linear_map import BlockDiagonal, Product
 from tests import meshes
 from tests.checks import assert_near
 
@@ -187,6 +187,32 @@ def test_block_diagonal():
     assert_near(matrix.multiply(columns(11)), dense @ columns(11).numpy(), 1e-13)
     assert matrix.transposed().shape == (11, 9)
     assert_near(matrix.transposed().multiply(columns(9)), dense.T @ columns(9).numpy(), 1e-13)
+
+
+def test_block_diagonal_in_planes():
+    """Rows that come in two planes hold those of all blocks, then those of all again."""
+    A, B = (
+        sp.random(2 * m, n, density=0.7, format="csr", rng=np.random.default_rng(m))
+        for m, n in ((3, 5), (2, 4))
+    )
+    upper = sp.block_diag([A[:3], B[:2]]).toarray()
+    lower = sp.block_diag([A[3:], B[2:]]).toarray()
+    dense = np.concatenate([upper, lower])
+    matrix = BlockDiagonal([SparseMatrix(M, torch.device("cpu")) for M in (A, B)], (2, 1))
+    assert_near(matrix.multiply(columns(9)), dense @ columns(9).numpy(), 1e-13)
+    assert_near(matrix.transposed().multiply(columns(10)), dense.T @ columns(10).numpy(), 1e-13)
+
+
+def test_product():
+    A = sp.random(6, 5, density=0.7, format="csr", rng=np.random.default_rng(3))
+    matrix = Product([CholeskyFactor(spd()), SparseMatrix(A, torch.device("cpu"))])
+    dense = np.linalg.inv(spd().toarray()) @ A.toarray()
+    assert matrix.shape == (6, 5)
+    assert matrix.transposed().shape == (5, 6)
+    assert_near(matrix.multiply(columns(5)), dense @ columns(5).numpy(), 1e-13)
+    assert_near(matrix.transposed().multiply(columns(6)), dense.T @ columns(6).numpy(), 1e-13)
+    single = matrix.multiply(columns(5).float())  # rounded once, at the end
+    assert torch.equal(single, matrix.multiply(columns(5).float().double()).float())
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc for its memory")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 import diffpoisson as dp
@@ -15,15 +15,23 @@ from njf_models.njf import Prediction, centre_areas, centre_vertices
 VERTEX_WEIGHT = 10.0  # λ of the paper's eq. 8; the authors' experiments use it too
 
 
+Reduction = Literal["mean", "none"]
+
+
 class Loss(NamedTuple):
-    """A weighted sum and its terms, each a scalar averaged over the batch."""
+    """A weighted sum and its terms: averaged over the batch, or (…, parts) if not reduced."""
 
-    total: Float[Tensor, ""]
-    vertices: Float[Tensor, ""]
-    jacobians: Float[Tensor, ""]
+    total: Float[Tensor, "*batch"]
+    vertices: Float[Tensor, "*batch"]
+    jacobians: Float[Tensor, "*batch"]
 
 
-def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#batch n c"]) -> Loss:
+def paper_loss(
+    shape: Shape,
+    prediction: Prediction,
+    target: Float[Tensor, "*#batch n c"],
+    reduction: Reduction = "mean",
+) -> Loss:
     """10 Σ |Vⱼ| ‖Φⱼ - Ψⱼ‖² + Σ |tⱼ| ‖Rⱼ - Jⱼ‖² at unit total area, averaged over the shapes.
 
     Areas enter as shares of their shape's area, so that a batch weighs its shapes alike and the
@@ -33,16 +41,25 @@ def paper_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#ba
         shape: the source(s).
         prediction: what the network made of them.
         target: (…, n, c) Ψ, the images of the vertices, in any position.
+        reduction: "mean" over the shapes, or "none" for the loss of each.
     """
-    n_parts = shape.mesh.n_parts
+    mesh = shape.mesh
     difference = prediction.vertices - centre_areas(shape, target)
     vertices = shape.vertex_weights.to(difference.dtype) * difference.square().sum(-1)
-    difference = prediction.jacobians - dp.jacobians(shape.mesh, target)
+    difference = prediction.jacobians - dp.jacobians(mesh, target)
     jacobians = shape.face_weights.to(difference.dtype) * difference.square().sum((-2, -1))
-    return _sum(vertices.sum(-1).mean() / n_parts, jacobians.sum(-1).mean() / n_parts)
+    return _sum(
+        _reduced(vertices, mesh.part_of_vertex, mesh.n_parts, reduction),
+        _reduced(jacobians, mesh.part_of_face, mesh.n_parts, reduction),
+    )
 
 
-def turned_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#batch n 2"]) -> Loss:
+def turned_loss(
+    shape: Shape,
+    prediction: Prediction,
+    target: Float[Tensor, "*#batch n 2"],
+    reduction: Reduction = "mean",
+) -> Loss:
     """`paper_loss` after each target has been turned about its centre onto the map.
 
     For maps whose energy does not see rotations, as UV maps' does not: where a patch is bent so far
@@ -52,6 +69,7 @@ def turned_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#b
         shape: the source(s).
         prediction: what the network made of them, maps to the plane.
         target: (…, n, 2) Ψ, the images of the vertices, in any position.
+        reduction: "mean" over the shapes, or "none" for the loss of each.
     """
     with torch.no_grad():
         part, phi = shape.mesh.part_of_vertex, prediction.vertices
@@ -60,7 +78,7 @@ def turned_loss(shape: Shape, prediction: Prediction, target: Float[Tensor, "*#b
         sums = covariance.new_zeros(*covariance.shape[:-3], shape.mesh.n_parts, 2, 2)
         turns = dp.closest_rotation(sums.index_add(-3, part, covariance))
         turned = (turns[..., part, :, :] @ target[..., None].to(phi.dtype))[..., 0]
-    return paper_loss(shape, prediction, turned)
+    return paper_loss(shape, prediction, turned, reduction)
 
 
 def official_loss(
@@ -79,8 +97,8 @@ def official_loss(
 
 
 def distortion_loss(
-    shape: Shape, prediction: Prediction, epsilon: float = 0.1
-) -> Float[Tensor, ""]:
+    shape: Shape, prediction: Prediction, epsilon: float = 0.1, reduction: Reduction = "mean"
+) -> Float[Tensor, "*batch"]:
     """Mean over the area of log(E / 4), averaged over the shapes; near 0 at isometries.
 
     E is the symmetric Dirichlet energy of the emitted map, regularised so that flips are finite and
@@ -90,10 +108,20 @@ def distortion_loss(
         shape: the source(s).
         prediction: maps to the plane.
         epsilon: of `diffpoisson.symmetric_dirichlet`.
+        reduction: "mean" over the shapes, or "none" for the loss of each.
     """
     J = dp.jacobians(shape.mesh, prediction.vertices)
     density = (dp.symmetric_dirichlet(J, epsilon) / 4).log()
-    return (shape.face_weights.to(density.dtype) * density).sum(-1).mean() / shape.mesh.n_parts
+    weighted = shape.face_weights.to(density.dtype) * density
+    return _reduced(weighted, shape.mesh.part_of_face, shape.mesh.n_parts, reduction)
+
+
+def _reduced(
+    values: Float[Tensor, "*batch n"], part: Int[Tensor, "n"], n_parts: int, reduction: Reduction
+) -> Tensor:
+    """The sum over each part, or its mean over parts and batch."""
+    sums = values.new_zeros(*values.shape[:-1], n_parts).index_add(-1, part, values)
+    return sums if reduction == "none" else sums.mean()
 
 
 def _sum(vertices: Tensor, jacobians: Tensor) -> Loss:
@@ -101,3 +129,4 @@ def _sum(vertices: Tensor, jacobians: Tensor) -> Loss:
 
 
 LOSSES = {"paper": paper_loss, "turned": turned_loss, "official": official_loss}
+PER_SHAPE = {"paper": paper_loss, "turned": turned_loss}  # those with a reduction

@@ -26,7 +26,7 @@ from torch.utils.data import DataLoader, Dataset
 import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
-from njf_models.losses import LOSSES, Loss, distortion_loss
+from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss
 from njf_models.metrics import count_flips
 from njf_models.njf import NeuralJacobianField, Prediction
 
@@ -133,12 +133,15 @@ class Objective:
         distortion: weight of `losses.distortion_loss`, for maps to the plane.
         epsilon: its regularisation.
         augment: whether each batch is turned, mirrored and scaled at random.
+        robust: whether a shape counts by log(1 + its supervised loss): a hard one, which pulls
+            a thousand times as hard as a good one, then pulls about as hard.
     """
 
     supervised: str | None = "paper"
     distortion: float = 0.0
     epsilon: float = 0.1
     augment: bool = False
+    robust: bool = False
 
     def __post_init__(self) -> None:
         if self.supervised is not None and self.supervised not in LOSSES:
@@ -148,12 +151,20 @@ class Objective:
             )
         if self.supervised is None and not self.distortion > 0:
             raise ValueError("Objective: without targets, distortion must have a positive weight")
+        if self.robust and self.supervised not in PER_SHAPE:
+            raise ValueError(
+                f"Objective: robust needs a supervised loss of each shape, one of "
+                f"{sorted(PER_SHAPE)}, got {self.supervised!r}"
+            )
 
     def __call__(self, batch: Batch, prediction: Prediction) -> Loss:
         """Loss of one round, and its terms."""
         zero = prediction.vertices.new_zeros(())
         loss = Loss(zero, zero, zero)
-        if self.supervised is not None:
+        if self.robust and self.supervised is not None:
+            each = PER_SHAPE[self.supervised](batch.shape, prediction, batch.target, "none")
+            loss = Loss(each.total.log1p().mean(), each.vertices.mean(), each.jacobians.mean())
+        elif self.supervised is not None:
             loss = LOSSES[self.supervised](batch.shape, prediction, batch.target)
         if self.distortion:
             distortion = distortion_loss(batch.shape, prediction, self.epsilon)
@@ -293,8 +304,9 @@ def make_trainer(
     best = ModelCheckpoint(filename="best", monitor="validation/loss", **where)
     # Lightning's own save_last saves only where the monitored value got better.
     last = ModelCheckpoint(filename="last", save_on_exception=True, **where)
+    ending = _SaveAtTheEnd(where["dirpath"] / "last.ckpt")
     rate = LearningRateMonitor(logging_interval="epoch")
-    callbacks: list[Callback] = [best, last, TQDMProgressBar(), rate]
+    callbacks: list[Callback] = [best, last, ending, TQDMProgressBar(), rate]
     if stop_after is not None:
         callbacks.append(EarlyStopping("validation/loss", patience=stop_after))
     return lightning.Trainer(
@@ -312,6 +324,16 @@ def make_trainer(
         num_sanity_val_steps=0,
         enable_model_summary=False,
     )
+
+
+class _SaveAtTheEnd(Callback):
+    """Save the last step too, which need not be one that was validated."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
+        trainer.save_checkpoint(self.path)
 
 
 def last_checkpoint(folder: Path) -> Path | None:

@@ -561,7 +561,7 @@ FACTOR_CALLS = {  # two losses have two solves of each order, all directions of 
     "vmap grad": 2,
     "grad vmap": 2,
     "backward": 2,
-    "checkpoint": 3,
+    "checkpoint": 2,  # recomputing stops before a linear solve, whose backward needs no value of it
     "vjp": 2,
     "jvp": 2,
     "jacrev": 2,
@@ -583,7 +583,7 @@ def test_factor_calls(name, layer, monkeypatch):
         CholeskyFactor, "multiply", lambda self, x: calls.append(x.shape) or multiply(self, x)
     )
     apply(function, x)
-    assert len(calls) == FACTOR_CALLS[name]
+    assert len(calls) == FACTOR_CALLS[name] + (layer in GEOMETRY and name == "checkpoint")
 
 
 # ------------------------------------------------------- autocast

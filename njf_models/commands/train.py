@@ -53,6 +53,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default="paper",
         help="distance to targets; turned: after turning them onto the map (paper)",
     )
+    add("--robust", action="store_true", help="hard patches pull hardly more than good ones")
     add("--distortion", type=float, default=0.3, help="weight of the distortion loss (0.3)")
     add("--no-augment", dest="augment", action="store_false", help="no random turns and scales")
     add("--min-flatness", type=float, default=0.0, help="leave out patches below |Σ nA| / ΣA (0)")
@@ -86,6 +87,7 @@ def run(options: argparse.Namespace) -> int:
             "supervised": None if options.loss == "none" else options.loss,
             "distortion": options.distortion,
             "augment": options.augment,
+            "robust": options.robust,
         },
         learning_rate=options.rate,
         steps=options.steps,

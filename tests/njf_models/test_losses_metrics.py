@@ -82,11 +82,11 @@ def test_paper_loss_of_a_batch_is_the_mean_of_its_shapes():
     single = [made_up(shape, 2, i) for i, shape in enumerate(shapes)]
     union = Prediction(*(torch.cat(fields) for fields in zip(*(p for p, _ in single), strict=True)))
     target = torch.cat([t for _, t in single])
-    expected = np.mean(
-        [float(paper_loss(s, p, t).total) for s, (p, t) in zip(shapes, single, strict=True)]
-    )
+    each = [float(paper_loss(s, p, t).total) for s, (p, t) in zip(shapes, single, strict=True)]
     total = paper_loss(Shape.concatenate(shapes), union, target).total
-    assert_close(float(total), expected, rtol=1e-10, atol=0)
+    assert_close(float(total), np.mean(each), rtol=1e-10, atol=0)
+    totals = paper_loss(Shape.concatenate(shapes), union, target, "none").total
+    assert_close(totals, torch.tensor(each, dtype=totals.dtype), rtol=1e-10, atol=0)
 
 
 def test_turned_loss_of_a_batch_turns_each_target_as_the_svd_does():

@@ -123,6 +123,33 @@ def test_objectives_without_a_target_or_a_loss(patches):
         Objective(supervised=None)
 
 
+def test_a_robust_objective_takes_the_logarithm_of_each_shape(patches):
+    batch = Batch.pack(
+        [UVExamples(patches, n_points=16, use_wks=False)[i] for i in range(3)]
+    ).moved(Motions.random(3))
+    model = NeuralJacobianField(**MODEL)
+    with torch.no_grad():
+        prediction = model(batch.shape, model.encode(batch.points))
+    each = paper_loss(batch.shape, prediction, batch.target, "none")
+    loss = Objective(robust=True)(batch, prediction)
+    assert float(loss.total) == pytest.approx(float((1 + each.total).log().mean()), rel=1e-6)
+    assert float(loss.vertices) == pytest.approx(float(each.vertices.mean()), rel=1e-6)
+    for supervised in ("official", None):
+        with pytest.raises(ValueError, match="robust needs a supervised loss of each shape"):
+            Objective(supervised=supervised, distortion=1.0, robust=True)
+
+
+def test_the_last_step_is_saved_where_none_was_validated_after_it(patches, tmp_path):
+    module = NJFTraining(MODEL, steps=5)
+    examples = UVExamples(patches, n_points=16, use_wks=False)
+    trainer = make_trainer(tmp_path, steps=5, validate_every=2)
+    trainer.fit(module, loader(examples, 1), loader(examples, 4))
+    record = torch.load(last_checkpoint(tmp_path), weights_only=False)
+    assert record["global_step"] == 5
+    for name, value in module.state_dict().items():
+        assert torch.equal(record["state_dict"][name], value)
+
+
 def test_unsupervised_training_lowers_distortion(patches, tmp_path):
     trainer = make_trainer(tmp_path, steps=30, validate_every=15)
     objective = {"supervised": None, "distortion": 1.0}

@@ -40,11 +40,10 @@ class SparseMatrix(Matrix):
 
     def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
         """A x."""
-        # Autocast would round geometry to half precision behind the caller's back.
-        with torch.autocast(x.device.type, enabled=False):
-            # As A @ x, which would clear the memory of y first, and copy it once more.
-            y = x.new_empty(self.shape[0], x.shape[1])
-            return torch.addmm(y, self._in(x.dtype), x, beta=0, out=y)
+        # Written as a product into given memory: A @ x would clear that first and copy it once more,
+        # and autocast would round geometry to half precision behind the caller's back.
+        y = x.new_empty(self.shape[0], x.shape[1])
+        return torch.addmm(y, self._in(x.dtype), x, beta=0, out=y)
 
     def transposed(self) -> SparseMatrix:
         """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""

@@ -414,6 +414,30 @@ def test_a_number_is_not_rounded(unchecked):
         assert torch.equal(given(R, handles=q), expected(R, handles=q))
 
 
+def test_numbers_of_any_width():
+    """Indices of 32 bits and weights of single precision are converted, exactly."""
+    mesh = dp.Mesh(*meshes.disk())
+    R = field(mesh)
+    pins, handles = torch.tensor([5, 1]), torch.tensor([3, 7])
+    q = torch.eye(3, dtype=torch.float64)[:2]
+    strengths = torch.tensor([0.3, 2])
+    weights = torch.arange(mesh.n_faces, dtype=torch.float32) / 7 + 1
+
+    def solution(indices, reals):
+        options = {"handle_weights": strengths.to(reals), "face_weights": weights.to(reals)}
+        solver = dp.PoissonSolver(
+            mesh, pins=pins.to(indices), handles=handles.to(indices), **options
+        )
+        given = {"pins": q, "handles": 2 * q}
+        assert solver.constraints.face_weights.dtype == torch.float64
+        union = dp.PoissonSolver.concatenate([solver])
+        return union(R, **given), solver(R, **given, face_weights=weights.to(reals))
+
+    expected = solution(torch.int64, torch.float64)
+    for actual, exact in zip(solution(torch.int32, torch.float32), expected, strict=True):
+        assert torch.equal(actual, exact)
+
+
 @pytest.mark.parametrize("weight", [2.0, 0.5])
 def test_uniform_face_weights_count_against_handles(weight):
     """Face weights w and handles of strength w a are faces without weights and handles a."""
@@ -436,3 +460,4 @@ def test_editing_a_gauge_mask_afterwards_changes_nothing():
     mask[:] = True
     assert torch.equal(solver(R), expected)
     assert_near(solver.update(mesh.vertices)(R), expected, SOLVE)
+    assert_near(dp.PoissonSolver.concatenate([solver])(R), expected, SOLVE)

@@ -115,12 +115,13 @@ def test_faces_too_thin_for_lengths_are_refused():
     refused = 0
     for x in np.linspace(0.1, 0.9, 30):
         turned = np.array([[0, 0], [1, 0], [x, 1e-9]]) @ [[0.6, -0.8], [0.8, 0.6]]
+        mesh = dp.Mesh(turned, np.array([[0, 1, 2]]))
         try:
-            L = dp.laplacian(dp.Mesh(turned, np.array([[0, 1, 2]])), intrinsic_delaunay=True)
-            assert np.isfinite(L.toarray()).all()
-        except dp.MeshError as error:
-            assert "faces as thin as these; remesh them" in str(error)
+            L = dp.laplacian(mesh, intrinsic_delaunay=True)
+        except dp.MeshError:
             refused += 1
+        else:
+            assert np.isfinite(L.toarray()).all()
     assert refused
 
 

@@ -585,7 +585,7 @@ def test_moved_positions_without_area_are_refused():
         (
             lambda m: torch.vmap(lambda v: dp.Mesh.cleaned(v, F))(torch.from_numpy(V)[None]),
             dp.MeshError,
-            "Mesh: vertices require grad",
+            "Mesh: vertices require grad, but a mesh is constant",
         ),
         (
             lambda m: m.split_vertices(V),

@@ -115,6 +115,7 @@ SOLVER = dp.PoissonSolver(MESH)
         (lambda: SOLVER(FIELD.numpy()), "PoissonSolver: R must be a torch tensor"),
         (lambda: SOLVER(FIELD, vertices=[0]), "PoissonSolver: vertices must be a torch tensor"),
         (lambda: SOLVER(FIELD, face_weights=1), "PoissonSolver: face_weights must be a torch"),
+        (lambda: SOLVER(FIELD, translations=[0]), "PoissonSolver: translations must be a torch"),
         (lambda: SOLVER(FIELD, refinements=1.5), "PoissonSolver: refinements must be an integer"),
         (lambda: SOLVER.solve_laplacian([0]), "solve_laplacian: b must be a torch tensor"),
         (

@@ -193,6 +193,10 @@ def test_single_precision():
     assert phi.dtype == v.grad.dtype == torch.float32
     assert_near(phi.detach(), expected.detach(), 1e-6)
     assert_near(v.grad, w.grad, 1e-5)
+    turns = field(mesh, seed=1).float()
+    phi = solved(single, R.float(), {"transforms": turns}, **halved)
+    expected = solved(rounded, turns.double() @ R.float().double(), **doubled)
+    assert torch.equal(phi, expected.float())
 
 
 def test_update_keeps_what_depends_on_the_faces():
@@ -436,6 +440,14 @@ def test_numbers_of_any_width():
     expected = solution(torch.int64, torch.float64)
     for actual, exact in zip(solution(torch.int32, torch.float32), expected, strict=True):
         assert torch.equal(actual, exact)
+
+
+def test_handles_are_of_strength_one_by_default():
+    mesh, handles = dp.Mesh(*meshes.disk()), torch.tensor([3, 7])
+    R, q = field(mesh), torch.ones(2, 3, dtype=torch.float64)
+    default = dp.PoissonSolver(mesh, handles=handles)
+    one = dp.PoissonSolver(mesh, handles=handles, handle_weights=1.0)
+    assert torch.equal(default(R, handles=q), one(R, handles=q))
 
 
 @pytest.mark.parametrize("weight", [2.0, 0.5])

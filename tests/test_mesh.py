@@ -68,7 +68,7 @@ REJECTED = {
     "inf": (placed(V, ([0, 3], 1), np.inf), F, "2 vertices [0, 3] with a coordinate that is not"),
     "unreferenced": (np.r_[V, V + 2], F, "4 vertices [4, 5, 6, 7] that no face uses"),
     "many culprits": (np.r_[V, V, V], F, "8 vertices [4, 5, 6, 7, 8, …] that no face uses"),
-    "zero area": (placed(V, 3, [0.3, 0, 0]), F, "1 face [1] of zero area"),
+    "zero area": (placed(V, 3, [0.3, 0, 0]), F, "1 face [1] of zero area; Mesh.cleaned"),
     "coincident vertices": (placed(V, 3, V[0]), F, "2 faces [1, 3] of zero area"),
     "zero area up to rounding": (
         np.array([[0.1, 0.3, 0], [0.1 + 0.2, 0.9, 0], [0.1 + 0.7, 2.4, 0]]),

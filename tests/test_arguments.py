@@ -152,6 +152,8 @@ def test_refinements():
     for given in (R, torch.stack([R, 2 * R])):
         expected = solver(given, **images)
         torch.testing.assert_close(solver(given, **images, refinements=2), expected)
+    free = dp.PoissonSolver(mesh)
+    torch.testing.assert_close(free(R, refinements=1), free(R))
     with pytest.raises(ValueError, match="refinements know the mesh's own geometry only"):
         solver(R, **images, vertices=mesh.vertices, refinements=1)
     with pytest.raises(ValueError, match="refinements must be at least 0, got -1"):

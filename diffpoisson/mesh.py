@@ -425,7 +425,7 @@ class Mesh:
             raise MeshError(f"Mesh.cleaned: none of the {len(faces)} faces is usable")
 
         used = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
-        used[new_faces[keep].flatten()] = True
+        used[new_faces[keep]] = True
         new_index = _new_indices(used)
         mesh = Mesh(vertices[used], new_index[new_faces[keep]])
         return CleanedMesh(mesh, new_index[merged], _new_indices(keep))
@@ -531,7 +531,7 @@ def _validate(vertices: Tensor, faces: Tensor) -> None:
     finite = vertices.isfinite().all(dim=1)
     _reject(~finite, "with a coordinate that is not finite", ("vertex", "vertices"))
     used = torch.zeros(n, dtype=torch.bool, device=vertices.device)
-    used[faces.flatten()] = True
+    used[faces] = True
     _reject(~used, "that no face uses", ("vertex", "vertices"))
     _reject(cells.degenerate(vertices.double()[faces]), _flat(faces))
     _check_range(vertices, faces)

@@ -14,7 +14,6 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from diffpoisson import poisson
 from diffpoisson.certificate import is_simple, orientations
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import gradient_operator
@@ -252,18 +251,6 @@ def test_too_thin_faces_raise_and_are_named(shape, aspect):
     mesh = dp.Mesh(*shape(aspect))
     with pytest.raises(dp.MeshError, match=f"thinnest face, {_thinnest(mesh)}, has a height of"):
         dp.PoissonSolver(mesh)
-
-
-def test_a_factor_without_digits_raises(monkeypatch):
-    """The check alone, on a factor of another matrix; with pins and handles too."""
-    mesh = dp.Mesh(*meshes.disk(0))
-    factorised = poisson.CholeskyFactor
-    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(2.5 * L, device))
-    for options in ({}, {"pins": torch.tensor([0, 5])}, {"handles": torch.tensor([3])}):
-        with pytest.raises(dp.MeshError, match="leaves no digit"):
-            dp.PoissonSolver(mesh, **options)
-    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(1.5 * L, device))
-    dp.PoissonSolver(mesh)  # wrong by a third: a digit is left
 
 
 def _thinnest(mesh: dp.Mesh) -> int:

@@ -457,6 +457,15 @@ def random_values(count: int, *, flips: bool, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(values)
 
 
+@pytest.mark.parametrize("size", [1e-120, 1e-30, 1e120])
+def test_the_sign_of_a_volume_does_not_depend_on_its_size(size):
+    """Where the determinant itself would under- or overflow."""
+    dtype = torch.float32 if size == 1e-30 else torch.float64
+    J = size * torch.diag_embed(torch.tensor([[2.0, 1, -1], [3, 2, 1]], dtype=dtype))
+    expected = size * torch.tensor([[2.0, 1, -1], [3, 2, 1]], dtype=dtype)
+    torch.testing.assert_close(dp.singular_values(J), expected, rtol=1e-6, atol=0)
+
+
 def test_singular_values_of_volumes():
     """As constructed, by the number and by LAPACK; the sign is that of the determinant."""
     values = random_values(100, flips=True)

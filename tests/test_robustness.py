@@ -301,23 +301,3 @@ def test_maps_that_are_not_finite_get_no_certificate():
 def test_certificates_need_no_graph():
     mesh = dp.Mesh(*meshes.planar_disk(0, 4))
     assert dp.certify(mesh, mesh.vertices.clone().requires_grad_()).injective
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_repair_names_what_it_refuses():
-    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
-    solver, uv = dp.PoissonSolver(mesh), mesh.vertices
-    for operation, first in ((dp.clamp_flips, solver), (dp.untangle, mesh)):
-        name = f"^{operation.__name__}: "
-        with pytest.raises(TypeError, match=name):
-            operation("mesh", uv)
-        with pytest.raises(TypeError, match=name + "uv must be a torch tensor"):
-            operation(first, uv.numpy())
-        with pytest.raises(ValueError, match=name + "expected uv of shape"):
-            operation(first, uv[1:])
-        with pytest.raises(ValueError, match=name + "max_rounds must be at least 0"):
-            operation(first, uv, max_rounds=-1)
-    with pytest.raises(ValueError, match=r"^clamp_singular_values: expected J of shape"):
-        dp.clamp_singular_values(torch.eye(3), 1, 2)
-    with pytest.raises(TypeError, match=r"^clamp_singular_values: smallest must be a number"):
-        dp.clamp_singular_values(torch.eye(2), None, 2)

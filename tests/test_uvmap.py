@@ -86,6 +86,24 @@ def test_every_start_ends_valid_and_as_good_as_slim(kind):
     assert set(result.milliseconds) >= {"slim", "certify"}
 
 
+def test_stages_run_where_flips_are_left():
+    mesh = dp.Mesh(*meshes.disk(0, 4))
+    flat = mesh.vertices[:, :2]
+    corner = int((mesh.faces == mesh.faces.flatten().bincount().argmin()).any(1).nonzero()[0])
+    a, b, c = mesh.faces[corner]
+    vertex = min((a, b, c), key=lambda v: int((mesh.faces == v).sum()))
+    one_flip = flat.clone()
+    one_flip[vertex] = 2 * flat[[a, b, c]].mean(0) - flat[vertex] - 0.5 * (flat[vertex] - flat.mean(0))
+    assert exact_flips(one_flip[mesh.faces].numpy()) == 1
+    for start, method in (
+        (flat, "init"),
+        (one_flip, "init+clamp"),
+        (flat * torch.tensor([1, -1]), "init+clamp+untangle"),
+        (0 * flat, "tutte"),
+    ):
+        assert dp.parameterize(mesh, start, tolerance=1e-2).method == method
+
+
 def test_result_does_not_depend_on_unit():
     mesh, _, uv = spoiled(1, 1.2)
     large = dp.Mesh(1e5 * mesh.vertices, mesh.faces)

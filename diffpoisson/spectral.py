@@ -98,8 +98,8 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures
-    areas = mesh.areas.double()[:, None]
-    shares = areas * _voronoi_shares(mesh.vertices.double()[mesh.faces])
+    mesh._require_triangles("Voronoi areas")
+    shares = mesh._double_measures[:, None] * _voronoi_shares(mesh._corners)
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
     return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)
 
@@ -152,7 +152,7 @@ def wave_kernel_signature(
     )
     signature = vectors[:, mesh.n_components :].double() ** 2 @ weights
     if scale_invariant:
-        signature = signature * mesh.measures.double().sum()
+        signature = signature * mesh._double_measures.sum()
     return signature.to(mesh.dtype)
 
 

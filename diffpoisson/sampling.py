@@ -53,7 +53,7 @@ def sample_surface(
     """
     require_mesh("sample_surface", mesh)
     require_integer("sample_surface", "n_samples", n_samples, least=0)
-    mesh._require_triangles("surface samples")
+    mesh._require_triangles("sample_surface: areas")
     # Inverting the cumulative area has no limit on the number of faces, unlike torch.multinomial.
     cumulative = mesh._double_measures.cumsum(0)
 

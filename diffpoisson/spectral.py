@@ -98,7 +98,7 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures
-    mesh._require_triangles("Voronoi areas")
+    mesh._require_triangles("lumped_mass: Voronoi areas")
     shares = mesh._double_measures[:, None] * _voronoi_shares(mesh._corners)
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
     return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)

@@ -285,9 +285,9 @@ def check_solution(a: Arguments, phi: Tensor) -> None:
         return
     operator = gradient_operator(m)
     D, G = operator.divergence_matrix, operator.matrix
-    D = D.multiply(solver.constraints.face_weights.numpy().repeat(m.cell_dim)).tocsr()
+    D = D.multiply(np.tile(solver.constraints.face_weights.numpy(), m.cell_dim)).tocsr()
     intrinsic = R.double() if R.shape[-1] == m.cell_dim else R.double() @ m._double_frames
-    rows = intrinsic.movedim((-3, -1), (0, 1)).reshape(m.n_faces * m.cell_dim, -1).numpy()
+    rows = intrinsic.movedim((-1, -3), (0, 1)).reshape(m.n_faces * m.cell_dim, -1).numpy()
     x = phi.double().movedim(-2, 0).reshape(m.n_vertices, -1).numpy()
     L = D @ G
     residual = np.abs(D @ rows - L @ x)

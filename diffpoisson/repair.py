@@ -16,7 +16,6 @@ import math
 import numbers
 
 import numpy as np
-import scipy.optimize
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -168,6 +167,8 @@ def _descend(mesh: Mesh, uv: Tensor, epsilon: float, iterations: int) -> Float[T
     def stop_if_valid(x: np.ndarray) -> None:
         if _worst(mesh, map_of(x)) > 0:
             raise StopIteration
+
+    import scipy.optimize  # noqa: PLC0415  (a twentieth of the time to import the package)
 
     result = scipy.optimize.minimize(
         value_and_gradient,

@@ -93,7 +93,7 @@ class Figure:
 
 
 def alternate(contestants: Mapping[str, Work], turns: int = 9, at_least: float = 0.02) -> Seconds:
-    """Processor seconds per call of each contestant in each turn, who goes first changing from turn to turn.
+    """Processor seconds per call of each contestant in each turn; each goes first at times.
 
     Args:
         contestants: what to call.
@@ -111,8 +111,9 @@ def alternate(contestants: Mapping[str, Work], turns: int = 9, at_least: float =
 
 
 def _repeats(work: Work, at_least: float) -> int:
-    work()
-    return max(1, round(at_least / max(_timed(work, 1), 1e-9)))
+    """How often work fits into a time, after a call to warm up; long work is warm at once."""
+    first = _timed(work, 1)
+    return 1 if first > at_least else max(1, round(at_least / max(_timed(work, 1), 1e-9)))
 
 
 def _timed(work: Work, repeats: int) -> float:
@@ -138,44 +139,39 @@ def speed_up(
 ) -> Figure:
     """How many times as fast as a peer."""
     target = None if at_least is None else Target("≥", at_least)
-    return _ratio(what, seconds, against, ours, against, target, **more)
+    return _ratio(what, seconds, (against, ours), target, against=against, **more)
 
 
 def cost(
     what: str, seconds: Seconds, against: str, at_most: float, *, ours: str = "ours", **more: Any
 ) -> Figure:
     """How many times a peer's time."""
-    return _ratio(what, seconds, ours, against, against, Target("≤", at_most), **more)
+    target = Target("≤", at_most)
+    return _ratio(what, seconds, (ours, against), target, against=against, **more)
 
 
 def _ratio(
-    what: str,
-    seconds: Seconds,
-    numerator: str,
-    denominator: str,
-    against: str,
-    target: Target | None,
-    **more: Any,
+    what: str, seconds: Seconds, parts: tuple[str, str], target: Target | None, **more: Any
 ) -> Figure:
+    numerator, denominator = parts
     return Figure(
         what,
-        against,
-        Spread.of(seconds[numerator] / seconds[denominator]),
+        value=Spread.of(seconds[numerator] / seconds[denominator]),
         target=target,
-        seconds={name: Spread.of(seconds[name]) for name in sorted({numerator, denominator})},
+        seconds={name: Spread.of(seconds[name]) for name in sorted(parts)},
         **more,
     )
 
 
 def exponent(
-    what: str, sizes: Iterable[int], seconds: Iterable[float], at_most: float, **more: Any
+    what: str, sizes: Iterable[int], times: Iterable[float], at_most: float, **more: Any
 ) -> Figure:
     """The power of the size that fits times best, with its standard error, over four sizes or more.
 
     Raises:
         ValueError: fewer than four sizes.
     """
-    x, y = np.log(np.array(list(sizes), dtype=float)), np.log(np.array(list(seconds)))
+    x, y = np.log(np.array(list(sizes), dtype=float)), np.log(np.array(list(times)))
     if len(x) < 4:
         raise ValueError(f"exponent: four sizes or more, got {len(x)}")
     x = x - x.mean()

@@ -60,10 +60,8 @@ def peak_flops(dtype: torch.dtype, n: int = 1536) -> float:
 
 
 class _Mallinfo(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keep".split()
-    ]
+    _names = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks")
+    _fields_ = [(name, ctypes.c_size_t) for name in (*_names, "uordblks", "fordblks", "keep")]
 
 
 def heap_bytes() -> int:
@@ -93,12 +91,27 @@ def peak_memory(work: Callable[[], object]) -> int:
     Memory that malloc kept from earlier work is given back before, or the work would reuse it.
     """
     work()  # one-time buffers of libraries are none of its own
+    reset_peak()
+    before = resident()
+    work()
+    return peak() - before
+
+
+def reset_peak() -> None:
+    """Give free memory back, and forget earlier peaks."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-    before = _status("VmRSS")
-    work()
-    return _status("VmHWM") - before
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def resident() -> int:
+    """Bytes of this process in memory."""
+    return _status("VmRSS")
+
+
+def peak() -> int:
+    """The most that this has been since `reset_peak`."""
+    return _status("VmHWM")
 
 
 def _status(name: str) -> int:

@@ -9,7 +9,8 @@ from torch import Tensor
 
 import diffpoisson as dp
 from tests.benchmarks import limits
-from tests.benchmarks.harness import Figure, Limit, alternate, main, speed_up
+from tests.benchmarks.figures import Figure, Limit, speed_up
+from tests.benchmarks.harness import alternate, main
 
 Energy = Callable[[Tensor], Tensor]
 
@@ -49,7 +50,7 @@ def energies(quick: bool) -> Iterator[Figure]:
             "ours": lambda ours=ours: gradient(ours),
             "torch.linalg.svdvals": lambda theirs=theirs: gradient(theirs),
         }
-        seconds = alternate(contestants, turns=7)
+        seconds = alternate(contestants, turns=2 if quick else 7)
         what = f"{name}, forward + backward, {m:,} faces, float32"
         yield speed_up(what, seconds, "torch.linalg.svdvals", 20.0, limit=limit)
 

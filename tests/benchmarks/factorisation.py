@@ -12,7 +12,8 @@ import torch
 import diffpoisson as dp
 from diffpoisson import testing
 from tests.benchmarks import limits
-from tests.benchmarks.harness import Figure, Limit, Spread, Target, alternate, cost, main, speed_up
+from tests.benchmarks.figures import Figure, Limit, Spread, Target, cost, speed_up
+from tests.benchmarks.harness import alternate, main
 from tests.benchmarks.operators import bare_solver, factor_bytes
 
 SUPERLU = {5: 1.0, 6: 2.5, 7: 4.0}  # by subdivisions of the icosahedron: least speed-up
@@ -28,7 +29,7 @@ def factor(quick: bool) -> Iterator[Figure]:
     for subdivisions in (2,) if quick else SUPERLU:
         vertices, faces = testing.sphere(0, subdivisions)
         L = dp.laplacian(dp.Mesh(vertices, faces))[1:, 1:]
-        seconds = dict(alternate(_factorisations(vertices, faces, L), turns=7))
+        seconds = dict(alternate(_factorisations(vertices, faces, L), turns=2 if quick else 7))
         ways = [name for name in seconds if "SuperLU" in name]
         best = min(ways, key=lambda name: float(np.median(seconds[name])))
         seconds["SciPy SuperLU"] = seconds[best]
@@ -66,7 +67,7 @@ def eigenpairs(quick: bool) -> Iterator[Figure]:
             "ours": lambda: dp.laplacian_eigenpairs(mesh, PAIRS, solver=solver),
             "scipy eigsh(sigma=0)": lambda: eigsh(L, M),
         },
-        turns=7,
+        turns=2 if quick else 7,
     )
     ours, _ = dp.laplacian_eigenpairs(mesh, PAIRS, solver=solver)
     theirs = torch.from_numpy(eigsh(L, M))

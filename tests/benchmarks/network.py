@@ -21,15 +21,8 @@ from njf_models.field import FieldMLP
 from njf_models.losses import paper_loss
 from njf_models.njf import NeuralJacobianField, Prediction
 from tests.benchmarks import limits
-from tests.benchmarks.harness import (
-    Figure,
-    Limit,
-    Spread,
-    Target,
-    alternate,
-    main,
-    speed_up,
-)
+from tests.benchmarks.figures import Figure, Limit, Spread, Target, speed_up
+from tests.benchmarks.harness import alternate, main
 from tests.benchmarks.operators import csr
 
 # ------------------------------------------------------- plain
@@ -101,7 +94,7 @@ def field(quick: bool) -> Iterator[Figure]:
             "ours, bfloat16": lambda: step(in_bfloat16),
             "nn.Sequential with nn.GroupNorm": lambda: step(plain),
         },
-        turns=9,
+        turns=2 if quick else 9,
     )
     what, peer = f"field MLP, forward + backward, {m:,} faces", "nn.Sequential with nn.GroupNorm"
     for name, dtype, least in (
@@ -127,7 +120,7 @@ def inference(quick: bool) -> Iterator[Figure]:
         torch.testing.assert_close(
             model(shape, code).vertices, plain(code).vertices, rtol=1e-3, atol=1e-3
         )
-        seconds = alternate(works, turns=9)
+        seconds = alternate(works, turns=2 if quick else 9)
         memory = {name: limits.peak_memory(work) for name, work in works.items()}
     what = f"NJF inference, {shape.mesh.n_faces:,} faces, code 2000, one mesh"
     flops = 2 * shape.mesh.n_faces * (3 * 128**2 + (6 + 9) * 128)
@@ -164,7 +157,7 @@ def training(quick: bool) -> Iterator[Figure]:
         work()
         gradients.append(model.field.layers[3].weight.grad.clone())
     torch.testing.assert_close(*gradients, rtol=0.01, atol=0.01 * float(gradients[0].abs().max()))
-    seconds = alternate(works, turns=7)
+    seconds = alternate(works, turns=2 if quick else 7)
     what = f"NJF training step, {shape.mesh.n_faces:,} faces, {targets} targets"
     per_face = 3 * 128**2 + (6 + 9) * 128
     encoder = 2 * targets * points * (6 * 128 + 128**2 + 128 * 256 + 256 * 1000)

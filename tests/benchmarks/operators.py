@@ -16,7 +16,8 @@ from diffpoisson import cells, testing
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import gradient_operator
 from tests.benchmarks import limits
-from tests.benchmarks.harness import Figure, Limit, alternate, cost, main, speed_up
+from tests.benchmarks.figures import Figure, Limit, cost, speed_up
+from tests.benchmarks.harness import alternate, main
 
 
 class BareLayer(NamedTuple):
@@ -84,7 +85,7 @@ def factor_bytes(mesh: dp.Mesh) -> int:
 def poisson(quick: bool) -> Iterator[Figure]:
     """One map with three coordinates, forward and backward, in float64."""
     mesh = dp.Mesh(*testing.sphere(0, 2 if quick else 5))
-    seconds, limit = _poisson(mesh, batch=(), turns=7 if quick else 15)
+    seconds, limit = _poisson(mesh, batch=(), turns=2 if quick else 15)
     yield cost(
         f"Poisson layer, forward + backward, {mesh.n_vertices:,} vertices, 3 columns",
         seconds,
@@ -98,7 +99,7 @@ def poisson_wide(quick: bool) -> Iterator[Figure]:
     """128 maps at once, against one by one and the bare wide solve."""
     mesh = dp.Mesh(*testing.sphere(0, 2 if quick else 5))
     batch = 4 if quick else 128
-    seconds, limit = _poisson(mesh, batch=(batch,), turns=7)
+    seconds, limit = _poisson(mesh, batch=(batch,), turns=2 if quick else 7)
     what = f"the same, {batch} maps at once"
     wide = "two cholespy solves and their CSR products"
     yield speed_up(what, seconds, wide, 0.9, limit=limit)
@@ -165,7 +166,7 @@ def gradient(quick: bool) -> Iterator[Figure]:
     """
     for subdivisions in (2,) if quick else (5, 8):
         mesh = dp.Mesh(*testing.sphere(0, subdivisions))
-        yield from _gradient(mesh, turns=7 if quick else 11)
+        yield from _gradient(mesh, turns=2 if quick else 11)
 
 
 def _gradient(mesh: dp.Mesh, turns: int) -> Iterator[Figure]:

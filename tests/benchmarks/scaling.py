@@ -13,7 +13,8 @@ import torch
 import diffpoisson as dp
 from diffpoisson import poisson, testing
 from tests.benchmarks import limits
-from tests.benchmarks.harness import Figure, Spread, Target, exponent, main
+from tests.benchmarks.figures import Figure, Spread, Target, exponent
+from tests.benchmarks.harness import main
 
 AT_MOST = {"factor": 1.5, "solve": 1.2, "solve's backward": 1.2}  # exponents; of all else 1.05
 T = TypeVar("T")

@@ -15,12 +15,13 @@ from torch import Tensor
 from njf_models.datasets.fingerprint import fingerprint
 from njf_models.datasets.patches import PatchOptions, PatchSampler
 from njf_models.datasets.sources import CSGParts
-from njf_models.datasets.uv import UVPatch, draw
+from njf_models.datasets.uv import FlatPatch, UVPatch, draw
 from njf_models.features import Motions
 from njf_models.field import FieldMLP
 from njf_models.njf import NeuralJacobianField
 from njf_models.training import Batch, Objective, UVExamples
-from tests.benchmarks.harness import Figure, Spread, Target, alternate, main, speed_up
+from tests.benchmarks.figures import Figure, Spread, Target, speed_up
+from tests.benchmarks.harness import alternate, main
 
 ARGUMENTS = {"face_features": 6, "point_features": 6, "code_size": 256, "output_dim": 2}
 OBJECTIVE = Objective(distortion=0.3, augment=True)
@@ -82,7 +83,7 @@ class Training:
 
 
 def throughput(quick: bool) -> Iterator[Figure]:
-    """Patches per second of a whole step: points, packing, network, solves, loss, backward, Adam."""
+    """Patches per second of a whole step: points, packing, network, solves, loss, Adam."""
     train, _ = examples(quick)
     packed, half, single = _trainings(train)
 
@@ -97,7 +98,7 @@ def throughput(quick: bool) -> Iterator[Figure]:
         "ours, bfloat16": half.step,
         "one patch a step": one_by_one,
     }
-    seconds = alternate(contestants, turns=7 if quick else 15)
+    seconds = alternate(contestants, turns=2 if quick else 15)
     faces = float(np.mean([len(patch.faces) for patch in train.patches]))
     what = f"UV training, patches of {faces:,.0f} faces, {PACKED} packed, patches per second"
     yield speed_up(what, seconds, "one patch a step", 3.0)
@@ -111,7 +112,7 @@ def accuracy(quick: bool) -> Iterator[Figure]:
     The median and quartiles are those of five validations in the last half of the time.
     """
     train, validation = examples(quick)
-    budget = 1.0 if quick else BUDGET
+    budget = 0.3 if quick else BUDGET
     marks = np.linspace(0.6, 1.0, 5) * budget
     packed, half, single = _trainings(train)
     steps, ours = _losses(packed, validation, marks)
@@ -168,24 +169,29 @@ def _losses_ratio(what: str, against: str, ours: list[float], theirs: list[float
 def examples(quick: bool) -> tuple[UVExamples, UVExamples]:
     """Patches of about 1,000 faces of generated parts, and of other parts to validate on."""
     faces, parts, per_part = ((100, 150), 2, 2) if quick else ((800, 1200), 12, 8)
-    options = PatchOptions(*faces)
-    patches: list[list[UVPatch]] = []
-    for raw in CSGParts(parts, n_faces=5 * faces[1]):
-        sampler = PatchSampler(raw.vertices, raw.faces, options)
-        draws = (draw(sampler, fingerprint(raw.name), 0, i, 0)[0] for i in range(per_part))
-        patches.append([_as_pair(flat, raw.name) for flat in draws if flat is not None])
-    held = max(1, parts // 4)
-    train, validation = sum(patches[held:], []), sum(patches[:held], [])
+    patches = generated_patches(faces, parts, per_part)
+    held = {patch.family for patch in patches[: len(patches) // 4]}
     kind = {"n_points": 256, "use_wks": False}
+    train = [patch for patch in patches if patch.family not in held]
+    validation = [patch for patch in patches if patch.family in held]
     return UVExamples(train, resample=True, **kind), UVExamples(validation, **kind)
 
 
-def _as_pair(flat: object, name: str) -> UVPatch:
-    patch, uv = flat.patch, flat.uv.double()
-    mesh = patch.mesh
-    return UVPatch(
-        mesh.vertices, mesh.faces, uv, flat.wks.float(), name, name, patch.flatness, flat.energy
-    )
+def generated_patches(faces: tuple[int, int], parts: int, per_part: int) -> list[UVPatch]:
+    """Training pairs of patches of so many faces, so many of each of some generated parts."""
+    patches = []
+    for raw in CSGParts(parts, n_faces=5 * faces[1]):
+        sampler = PatchSampler(raw.vertices, raw.faces, PatchOptions(*faces))
+        for i in range(per_part):
+            flat, _ = draw(sampler, fingerprint(raw.name), 0, i, 0)
+            if flat is not None:
+                patches.append(_pair(flat, raw.name))
+    return patches
+
+
+def _pair(flat: FlatPatch, name: str) -> UVPatch:
+    mesh, about = flat.patch.mesh, (name, name, flat.patch.flatness, flat.energy)
+    return UVPatch(mesh.vertices, mesh.faces, flat.uv.double(), flat.wks.float(), *about)
 
 
 MEASUREMENTS: dict[str, Callable[[bool], Iterator[Figure]]] = {

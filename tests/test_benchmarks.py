@@ -5,7 +5,6 @@ Nothing depends on how fast anything is.
 
 from __future__ import annotations
 
-import json
 import sys
 from importlib import import_module
 
@@ -44,10 +43,10 @@ def test_a_measurement_and_its_page(theme, name, tmp_path, monkeypatch):
     path = tmp_path / "figures.json"
     about = {"processor": "any", "bandwidth, GB/s": 1.0, "load": [0.5, 1.5]}
     figures.record(path, f"{theme}.{name}", measured, about)
-    assert figures.read(path)[f"{theme}.{name}"] == [
-        figures._figure(json.loads(json.dumps(entry)))
-        for entry in json.loads(path.read_text())[f"{theme}.{name}"]["figures"]
-    ]
+    for read, figure in zip(figures.read(path)[f"{theme}.{name}"], measured, strict=True):
+        assert (read.what, read.against, read.unit) == (figure.what, figure.against, figure.unit)
+        assert (read.value, read.target, read.limit) == (figure.value, figure.target, figure.limit)
+        assert read.seconds == figure.seconds
     assert len(report.figures_table(path).splitlines()) == 2 + len(measured) > 2
     assert "any; load average 0.5 to 1.5" in report.machines_table(path)
     assert report.limits_table(path).endswith("| bandwidth, GB/s | 1 |")

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.benchmarks import figures, harness, limits, report
+from diffpoisson import testing
+from tests.benchmarks import figures, harness, limits, maps, report
 from tests.benchmarks.figures import Spread
 
 THEMES = (
@@ -122,3 +123,18 @@ def test_limits_are_rates_of_this_planet():
         limits.peak_flops(torch.float32, 128),
     ):
         assert 1e7 < rate < 1e13
+
+
+def test_energies_of_maps_know_scales_mirrors_charts_and_flips():
+    flat, F = testing.planar_disk(0, 5)
+    V = np.c_[flat, np.zeros(len(flat))]
+    corners = 3 * flat[F] * [1, -1]
+    assert maps.energy(V, F, corners) == pytest.approx(4)
+    moved = np.where(np.arange(len(F))[:, None, None] < 7, corners * [-1, 1] + 100, corners)
+    assert maps.energy(V, F, moved) == pytest.approx(4)  # another chart, not mirrored
+    assert len(set(maps.chart_of_face(F, corners))) == 1
+    assert len(set(maps.chart_of_face(F, moved))) >= 2
+    stretched = flat[F] * [2, 1]
+    assert maps.energy(V, F, stretched) == pytest.approx(2 * np.sqrt(5 * 1.25))
+    flat[12] += [2.0, 0]  # an inner vertex far outside of its star
+    assert maps.energy(V, F, flat[F]) is None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
 from types import ModuleType
 
 import igl
@@ -18,6 +19,7 @@ from torch import Tensor
 import diffpoisson as dp
 import njf_models
 from diffpoisson import cells
+from diffpoisson.topology import component_labels
 from tests.benchmarks.figures import Figure, Spread, Target
 from tests.benchmarks.harness import alternate, main
 from tests.benchmarks.uv_training import generated_patches
@@ -26,6 +28,7 @@ Corners = np.ndarray  # (m, 3, 2) the image of each face's corners
 Mapper = Callable[[np.ndarray, np.ndarray], Corners]
 OURS = ("ours, from Tutte's map", "ours, from the network's")
 SLIM_ITERATIONS = (5, 20, 50)
+CONVERGED = 1e-5  # relative energies that differ by less are equal
 
 # ------------------------------------------------------- contestants
 
@@ -56,7 +59,7 @@ def libigl_slim(iterations: int) -> Mapper:
 
 
 def xatlas_chart(xatlas: ModuleType) -> Mapper:
-    """Charts grown without a limit on their cost, so that a disk stays whole."""
+    """Charts grown without a limit on their cost, so that few seams help the energy."""
 
     def flatten(vertices: np.ndarray, faces: np.ndarray) -> Corners:
         atlas = xatlas.Atlas()
@@ -114,74 +117,100 @@ def contestants() -> tuple[dict[str, Mapper], list[str]]:
 # ------------------------------------------------------- figures
 
 
+@dataclass
+class Maps:
+    """What a contestant made of each mesh: median seconds, energy (None if it flips), charts."""
+
+    seconds: list[float] = field(default_factory=list)
+    energy: list[float | None] = field(default_factory=list)
+    charts: list[int] = field(default_factory=list)
+
+
 def front(quick: bool) -> Iterator[Figure]:
     """Time from (V, F), and energy, of patches of generated parts; at two sizes.
 
-    A map is dominated by one that is faster and not more distorted: here by less than 1% of the
-    energy.
+    A map is dominated by one that is faster and not more distorted, but for `CONVERGED`, of as few
+    charts: seams would lower any energy.
     """
     mappers, missing = contestants()
     sizes = ((100, 200, 1),) if quick else ((800, 1200, 6), (8000, 12000, 2))
     for least, most, count in sizes:
         patches = generated_patches((least, most), count, 1)
         arrays = [(patch.mesh.vertices.numpy(), patch.mesh.faces.numpy()) for patch in patches]
-        times, energies = _measured(mappers, arrays, turns=1 if quick else 3)
+        results = _measured(mappers, arrays, turns=1 if quick else 3)
         faces = float(np.mean([len(F) for _, F in arrays]))
         title = f"UV maps of {len(arrays)} patches of {faces:,.0f} faces"
-        points = {name: {"seconds": times[name], "energy": energies[name]} for name in mappers}
+        points = {name: asdict(maps) for name, maps in results.items()}
         for name in OURS:
-            share = _not_dominated(name, times, energies)
+            share = _not_dominated(name, results)
             yield Figure(
                 f"{title}, {name}: share that no peer dominates",
                 "SLIM, xatlas, Blender",
                 Spread(share, share, share),
                 unit="",
                 target=Target("≥", 1.0),
-                seconds={other: Spread.of(values) for other, values in times.items()},
+                seconds={other: Spread.of(maps.seconds) for other, maps in results.items()},
                 details={"title": title, "points": points, "missing": missing},
             )
 
 
 def _measured(
     mappers: dict[str, Mapper], arrays: list[tuple[np.ndarray, np.ndarray]], turns: int
-) -> tuple[dict[str, list[float]], dict[str, list[float | None]]]:
-    """Median seconds and energy of each mapper on each mesh; None where a map flips."""
-    times: dict[str, list[float]] = {name: [] for name in mappers}
-    energies: dict[str, list[float | None]] = {name: [] for name in mappers}
+) -> dict[str, Maps]:
+    results = {name: Maps() for name in mappers}
     for V, F in arrays:
         works = {n: (lambda f=f, V=V, F=F: f(V, F)) for n, f in mappers.items()}
         for name, seconds in alternate(works, turns, at_least=0.0).items():
-            times[name].append(float(np.median(seconds)))
-            energies[name].append(energy(V, F, mappers[name](V, F)))
-    return times, energies
+            corners = mappers[name](V, F)
+            results[name].seconds.append(float(np.median(seconds)))
+            results[name].energy.append(energy(V, F, corners))
+            results[name].charts.append(int(chart_of_face(F, corners).max()) + 1)
+    return results
+
+
+def _not_dominated(name: str, results: dict[str, Maps]) -> float:
+    """The share of meshes on which no peer does as well in less time."""
+    mine = results[name]
+    peers = [maps for other, maps in results.items() if other not in OURS]
+    good = [
+        ours is not None
+        and not any(
+            theirs.energy[i] is not None
+            and theirs.charts[i] <= mine.charts[i]
+            and theirs.seconds[i] < mine.seconds[i]
+            and theirs.energy[i] < (1 + CONVERGED) * ours
+            for theirs in peers
+        )
+        for i, ours in enumerate(mine.energy)
+    ]
+    return float(np.mean(good))
 
 
 def energy(V: np.ndarray, F: np.ndarray, corners: Corners) -> float | None:
-    """Mean symmetric Dirichlet energy at the best scale of the whole; None where a map flips."""
+    """Mean symmetric Dirichlet energy at the best scale of the whole; None where a map flips.
+
+    A chart that is mirrored as a whole, as xatlas's are, counts as its mirror image.
+    """
     mesh = dp.Mesh(V.astype(np.float64), F)
     hats = cells.hat_gradients(mesh._corners, mesh._double_frames)
     J: Tensor = (hats @ torch.from_numpy(corners.astype(np.float64))).mT
-    det = dp.determinant(J)
-    if (det <= 0).all():  # the whole map mirrored
-        J = J * J.new_tensor([[-1], [1]])
+    areas = mesh.areas / mesh.areas.sum()
+    charts = torch.from_numpy(chart_of_face(F, corners))
+    signed = J.new_zeros(len(F)).index_add(0, charts, areas * dp.determinant(J))
+    J = torch.stack([J[:, 0], J[:, 1] * signed.sign()[charts, None]], dim=1)
     if dp.flipped(J).any():
         return None
-    areas = mesh.areas / mesh.areas.sum()
     stretch = (areas * J.square().sum((-2, -1))).sum()
     shrinkage = (areas * torch.linalg.inv(J).square().sum((-2, -1))).sum()
     return float(2 * (stretch * shrinkage).sqrt())
 
 
-def _not_dominated(
-    name: str, times: dict[str, list[float]], energies: dict[str, list[float | None]]
-) -> float:
-    peers = [other for other in times if other not in OURS]
-    good = []
-    for i, (mine, spent) in enumerate(zip(energies[name], times[name], strict=True)):
-        rivals = ((energies[peer][i], times[peer][i]) for peer in peers)
-        beaten = any(e is not None and t < spent and e < 1.01 * mine for e, t in rivals)
-        good.append(mine is not None and not beaten)
-    return float(np.mean(good))
+def chart_of_face(F: np.ndarray, corners: Corners) -> np.ndarray:
+    """(m,) the chart of each face: charts share no vertex at the same place."""
+    places = np.concatenate([F.reshape(-1, 1), corners.reshape(-1, 2)], axis=1)
+    unique, index = np.unique(places, axis=0, return_inverse=True)
+    corner_index = index.reshape(-1, 3)
+    return component_labels(corner_index, len(unique))[corner_index[:, 0]]
 
 
 MEASUREMENTS = {"front": front}

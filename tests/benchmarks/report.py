@@ -186,6 +186,8 @@ def _scatter(axes: Any, name: str, values: dict[str, Any], best: np.ndarray) -> 
     excess = np.array([e or np.nan for e in values["energy"]]) / best - 1
     kept = np.isfinite(excess)
     label = name if kept.all() else f"{name} ({(~kept).sum()} of {len(kept)} flip)"
+    if max(values["charts"]) > 1:
+        label += f", {min(values['charts'])} to {max(values['charts'])} charts"
     marker = "*" if name.startswith("ours") else "o"
     x, y = np.array(values["seconds"])[kept], np.maximum(excess[kept], 1e-7)
     middle = (np.median(x), np.median(y)) if kept.any() else ([], [])

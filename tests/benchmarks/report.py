@@ -170,19 +170,28 @@ def plot_front(figures: list[Figure], path: Path) -> Path:
     for axes, (title, points) in zip(
         picture.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
     ):
-        energies = [[e or np.inf for e in values["energy"]] for values in points.values()]
+        energies = [_of_one_chart(values) for values in points.values()]
         for name, values in points.items():
             _scatter(axes, name, values, np.min(energies, axis=0))
         axes.set(xscale="log", yscale="log", xlabel="seconds from (V, F), one thread")
-        axes.set(ylabel="symmetric Dirichlet energy over the least found, minus 1")
+        axes.set(ylabel="symmetric Dirichlet energy over the least of one chart, minus 1")
         axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)
     return _saved(picture, path)
 
 
+def _of_one_chart(values: dict[str, Any]) -> list[float]:
+    """Energies of the maps that neither flip nor cut the patch; infinite of the others."""
+    pairs = zip(values["energy"], values["charts"], strict=True)
+    return [energy if energy and charts == 1 else np.inf for energy, charts in pairs]
+
+
 def _scatter(axes: Any, name: str, values: dict[str, Any], best: np.ndarray) -> None:
-    """A contestant's meshes; those that it flips are not in the picture, but counted."""
+    """A contestant's meshes; those that it flips are not in the picture, but counted.
+
+    Energies that seams lower below the least of one chart stand at the lower edge.
+    """
     excess = np.array([e or np.nan for e in values["energy"]]) / best - 1
     kept = np.isfinite(excess)
     label = name if kept.all() else f"{name} ({(~kept).sum()} of {len(kept)} flip)"

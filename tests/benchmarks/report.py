@@ -174,7 +174,7 @@ def plot_front(figures: list[Figure], path: Path) -> Path:
         for name, values in points.items():
             _scatter(axes, name, values, np.min(energies, axis=0))
         axes.set(xscale="log", yscale="log", xlabel="seconds from (V, F), one thread")
-        axes.set(ylabel="symmetric Dirichlet energy over the least of one chart, minus 1")
+        axes.set(ylabel="energy over the least of one chart, minus 1")
         axes.set_title(title, fontsize=9)
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

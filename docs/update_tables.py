@@ -15,7 +15,8 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
 
-from tests.mutation import named, verdicts  # noqa: E402  (found by the line above)
+from tests.benchmarks import report  # noqa: E402  (found by the line above)
+from tests.mutation import named, verdicts  # noqa: E402
 
 RESULTS = DOCS / "results"
 
@@ -269,6 +270,7 @@ TABLES = {
     "poisson_cost": poisson_cost,
     "mutations": mutations,
     "survivors": survivors,
+    **report.TABLES,
 }
 
 

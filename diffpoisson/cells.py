@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Corners = Float[Tensor, "m k D"]
+Determinants = Float[Tensor, "m *D"]
 
 # The computed determinant of d edges of lengths |e| carries an absolute rounding error below c u
 # Π|e|, u the unit roundoff of float64: c = 8 for a cross product (two differences, two products and
@@ -20,14 +21,17 @@ _DETERMINANT_ROUNDOFF = {2: 8 * 2.0**-53, 3: 16 * 2.0**-53}
 _FACTORIAL = {2: 2.0, 3: 6.0}
 
 
-def measures(corners: Corners) -> Float[Tensor, "m"]:
-    """Area of each triangle or volume of each tetrahedron, whatever its orientation."""
-    determinant = determinants(corners)
-    size = determinant.abs() if determinant.ndim == 1 else _norm(determinant)
-    return size / _FACTORIAL[corners.shape[1] - 1]
+def measures(corners: Corners, determinant: Determinants | None = None) -> Float[Tensor, "m"]:
+    """Area of each triangle or volume of each tetrahedron, whatever its orientation.
+
+    Args:
+        corners: the cells.
+        determinant: `determinants(corners)`, where they are known already.
+    """
+    return _size(_or_new(determinant, corners)) / _FACTORIAL[corners.shape[1] - 1]
 
 
-def determinants(corners: Corners) -> Float[Tensor, "m *D"]:
+def determinants(corners: Corners) -> Determinants:
     """d! times the signed measure of each cell, (m,); as a normal vector, (m, 3), in space.
 
     Taken at the corner with the shortest edges: all corners agree, but there a sliver loses the
@@ -36,12 +40,10 @@ def determinants(corners: Corners) -> Float[Tensor, "m *D"]:
     return _determinant(_edges_at_best_corner(corners))
 
 
-def degenerate(corners: Corners) -> Bool[Tensor, "m"]:
+def degenerate(corners: Corners, determinant: Determinants | None = None) -> Bool[Tensor, "m"]:
     """Cells whose measure is indistinguishable from zero in float64, at any scale."""
-    edges = _edges_at_best_corner(corners)
-    determinant = _determinant(edges)
-    size = determinant.abs() if determinant.ndim == 1 else _norm(determinant)
-    return size <= _DETERMINANT_ROUNDOFF[edges.shape[1]] * _norm(edges).prod(dim=1)
+    bound = _DETERMINANT_ROUNDOFF[corners.shape[1] - 1] * _products_at_corners(corners).amin(1)
+    return _size(_or_new(determinant, corners)) <= bound
 
 
 def thinness(corners: Corners) -> Float[Tensor, "m"]:
@@ -53,7 +55,7 @@ def thinness(corners: Corners) -> Float[Tensor, "m"]:
     return heights / edges.amax(dim=1)
 
 
-def frames(corners: Corners) -> Float[Tensor, "m D d"]:
+def frames(corners: Corners, determinant: Determinants | None = None) -> Float[Tensor, "m D d"]:
     """Orthonormal basis of each cell's tangent space, as columns.
 
     Of a triangle in space: along its first edge and across it, B₁ × B₂ = normal. Else the identity.
@@ -63,18 +65,20 @@ def frames(corners: Corners) -> Float[Tensor, "m D d"]:
         return torch.eye(D, dtype=corners.dtype, device=corners.device).expand(m, D, D)
     first = corners[:, 1] - corners[:, 0]
     x = first / _norm(first)[:, None]
-    normal = determinants(corners)
+    normal = _or_new(determinant, corners)
     normal = normal / _norm(normal)[:, None]
     return torch.stack([x, torch.linalg.cross(normal, x)], dim=2)
 
 
-def hat_gradients(corners: Corners, frames: Float[Tensor, "m D d"]) -> Float[Tensor, "m d k"]:
+def hat_gradients(
+    corners: Corners, frames: Float[Tensor, "m D d"], determinant: Determinants | None = None
+) -> Float[Tensor, "m d k"]:
     """Gradient ∇λᵢ of each corner's hat function, in coordinates of the frames.
 
     ∇λᵢ is the inward normal of the facet opposite to corner i, of the length of that facet over d!
     times the cell's measure: 1 / height.
     """
-    determinant = determinants(corners)
+    determinant = _or_new(determinant, corners)
     if corners.shape[1] == 4:
         return _facet_normals(corners).mT / determinant[:, None, None]
     if determinant.ndim == 2:
@@ -86,25 +90,44 @@ def hat_gradients(corners: Corners, frames: Float[Tensor, "m D d"]) -> Float[Ten
 
 def _edges_at_best_corner(corners: Corners) -> Float[Tensor, "m d D"]:
     """The d edges that leave the corner where the product of their lengths is least, in order."""
+    best = _products_at_corners(corners.detach()).argmin(dim=1)
     if corners.shape[1] == 3:  # at a third of the cost: two corners share each edge
         edges = corners.roll(-1, dims=1) - corners  # from corner i to the next
-        lengths = _norm(edges.detach())
-        best = (lengths * lengths.roll(1, dims=1)).argmin(dim=1)[:, None, None]
+        best = best[:, None, None]
         pair = torch.cat([best, (best + 2) % 3], dim=1).expand(-1, -1, corners.shape[2])
         onward, back = edges.gather(1, pair).unbind(1)
         return torch.stack([onward, -back], dim=1)
+    return _edges_of_tetrahedra(corners)[torch.arange(len(best), device=best.device), best]
+
+
+def _products_at_corners(corners: Corners) -> Float[Tensor, "m k"]:
+    """The product of the lengths of the d edges at each corner."""
+    if corners.shape[1] == 4:
+        return _norm(_edges_of_tetrahedra(corners)).prod(dim=2)
+    a, b, c = corners.unbind(1)
+    x, y, z = _norm(b - a), _norm(c - b), _norm(a - c)
+    return torch.stack([x * z, y * x, z * y], dim=1)
+
+
+def _edges_of_tetrahedra(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3 3"]:
+    """From each corner to the others, in an order that keeps the orientation."""
     edges = corners[:, None, :, :] - corners[:, :, None, :]  # from corner i to corner j
-    # The other corners in an order that keeps the orientation.
     others = torch.tensor(_OTHERS, device=corners.device)
-    edges = edges[:, torch.arange(4, device=corners.device)[:, None], others]  # (m, k, d, D)
-    best = _norm(edges.detach()).prod(dim=2).argmin(dim=1)
-    return edges[torch.arange(len(edges), device=corners.device), best]
+    return edges[:, torch.arange(4, device=corners.device)[:, None], others]
 
 
 _OTHERS = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 
 
-def _determinant(edges: Float[Tensor, "m d D"]) -> Float[Tensor, "m *D"]:
+def _or_new(determinant: Determinants | None, corners: Corners) -> Determinants:
+    return determinants(corners) if determinant is None else determinant
+
+
+def _size(determinant: Determinants) -> Float[Tensor, "m"]:
+    return determinant.abs() if determinant.ndim == 1 else _norm(determinant)
+
+
+def _determinant(edges: Float[Tensor, "m d D"]) -> Determinants:
     a, b = edges[:, 0], edges[:, 1]
     if edges.shape[1] == 3:
         return (torch.linalg.cross(a, b) * edges[:, 2]).sum(-1)
@@ -121,5 +144,9 @@ def _facet_normals(corners: Float[Tensor, "m 4 3"]) -> Float[Tensor, "m 4 3"]:
 
 
 def _norm(vectors: Tensor) -> Tensor:
-    # Not torch.linalg.vector_norm: reverse over twice-nested forward mode raises in torch 2.13.
-    return vectors.square().sum(-1).sqrt()
+    # Not torch.linalg.vector_norm: reverse over twice-nested forward mode raises in torch 2.13. Not
+    # sum(-1) either, which takes five times as long for rows of two or three numbers.
+    x, *others = vectors.square().unbind(-1)
+    for y in others:
+        x = x + y
+    return x.sqrt()

@@ -176,8 +176,6 @@ def _segments_meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -
 
     They do unless one lies strictly on one side of the other's line.
     """
-    if len(a) == 0:
-        return np.zeros(0, dtype=bool)
     abc, abd, cda, cdb = (
         orientations(np.stack(corners, axis=1))
         for corners in ((a, b, c), (a, b, d), (c, d, a), (c, d, b))

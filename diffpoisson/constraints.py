@@ -132,7 +132,7 @@ class Constraints:
         """
         if self.gauge_mask is None:
             return None
-        sizes = sizes * (self.gauge_mask & (self.floating < self.n_floating))
+        sizes = sizes * self.gauge_mask
         totals = sizes.new_zeros(self.n_floating + 1).index_add(0, self.floating, sizes)
         shares = torch.cat([totals[:-1].reciprocal(), totals.new_zeros(1)])
         return sizes * shares[self.floating]
@@ -212,7 +212,7 @@ def _labels(mesh: Mesh, weights: Tensor, pins: Tensor) -> Int[Tensor, "n"]:
     if counts.all():
         return mesh.components
     covered = torch.zeros(mesh.n_vertices, dtype=torch.bool, device=mesh.device)
-    covered[mesh.faces[counts].flatten()] = True
+    covered[mesh.faces[counts]] = True
     covered[pins] = True
     if not covered.all():
         loose = describe_indices((~covered).nonzero()[:, 0], "vertex", "vertices")

@@ -43,7 +43,8 @@ def singular_values(J: Jacobian) -> Float[Tensor, "*batch d"]:
         finite = J.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
         magnitudes = torch.linalg.svdvals(torch.where(finite, J, 0))
         magnitudes = torch.where(finite[..., 0], magnitudes, torch.nan)
-        sign = torch.where(determinant(J) < 0, -1, 1).to(J)
+        # At unit size, where the determinant neither under- nor overflows.
+        sign = torch.where(determinant(J / magnitudes[..., :1, None]) < 0, -1, 1).to(J)
         return torch.cat([magnitudes[..., :2], sign[..., None] * magnitudes[..., 2:]], dim=-1)
     total, difference = _sum_and_difference(J)
     return torch.stack([total + difference, total - difference], dim=-1) / 2

@@ -46,7 +46,7 @@ def flatten_disk(
     """A flip-free map of a disk with low isometric distortion.
 
     Args:
-        mesh: a disk in space.
+        mesh: a disk in space, in float64.
         init: (n, 2) finite map to start from; Tutte's takes its place if nothing mends it.
         solver: of the mesh, made if it is needed.
         injective: keep the map from overlapping itself.
@@ -71,9 +71,10 @@ def flatten_disk(
 class _Stages:
     """The map as it passes through stages, with their names and times."""
 
+    uv: Tensor
+
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self.uv: Tensor = mesh.vertices.new_zeros(0, 2)
         self.passed: list[str] = []
         self.milliseconds: dict[str, float] = {}
 
@@ -85,7 +86,7 @@ class _Stages:
     @property
     def simple(self) -> bool:
         """Whether the map's boundary does not meet itself."""
-        return is_simple(self.uv[self.mesh.boundary_loops[0]].cpu().double().numpy())
+        return is_simple(self.uv[self.mesh.boundary_loops[0]].cpu().numpy())
 
     def start(self, name: str, make: Callable[[], Tensor]) -> None:
         """Begin with a map."""

@@ -40,11 +40,10 @@ class SparseMatrix(Matrix):
 
     def multiply(self, x: Float[Tensor, "cols k"]) -> Float[Tensor, "rows k"]:
         """A x."""
-        # Autocast would round geometry to half precision behind the caller's back.
-        with torch.autocast(x.device.type, enabled=False):
-            # As A @ x, which would clear the memory of y first, and copy it once more.
-            y = x.new_empty(self.shape[0], x.shape[1])
-            return torch.addmm(y, self._in(x.dtype), x, beta=0, out=y)
+        # Into given memory: A @ x would clear that first and copy it once more, and autocast would
+        # round geometry to half precision behind the caller's back.
+        y = x.new_empty(self.shape[0], x.shape[1])
+        return torch.addmm(y, self._in(x.dtype), x, beta=0, out=y)
 
     def transposed(self) -> SparseMatrix:
         """Aᵀ, stored as CSR too: multiplying by a transposed view is 50 times slower."""
@@ -293,9 +292,10 @@ class CellGeometry(NamedTuple):
     def at(cls, mesh: Mesh, vertices: Float[Tensor, "n D"]) -> CellGeometry:
         """The geometry of a mesh's cells at other positions, in float64."""
         corners = vertices.double()[mesh.faces]
-        frames = cells.frames(corners)
-        hats = cells.hat_gradients(corners, frames)
-        return cls(mesh, hats, frames, cells.measures(corners))
+        determinant = cells.determinants(corners)
+        frames = cells.frames(corners, determinant)
+        hats = cells.hat_gradients(corners, frames, determinant)
+        return cls(mesh, hats, frames, cells.measures(corners, determinant))
 
     def gradient(self, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch m c d"]:
         """∇Φ on each cell."""
@@ -358,7 +358,7 @@ def columns_to_matrices(
 def _gradient_matrix(mesh: Mesh) -> sp.csr_matrix:
     """∇ as (d·m, n): row m·i + j holds component i of the hat gradients of face j."""
     d, k = mesh.cell_dim, mesh.cell_dim + 1
-    hats = cells.hat_gradients(mesh._corners, mesh._double_frames)  # (m, d, k)
+    hats = cells.hat_gradients(mesh._corners, mesh._double_frames, mesh._determinants)  # (m, d, k)
     values = hats.movedim(1, 0).cpu().numpy()
     columns = np.tile(mesh.faces.cpu().numpy(), (d, 1))
     rows = np.arange(0, values.size + 1, k)

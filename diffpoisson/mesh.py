@@ -49,6 +49,7 @@ _OF_FACES = (
 
 # Cached properties that a union takes from its parts, one after the other.
 _OF_PARTS = (
+    "_determinants",
     "_double_measures",
     "_double_frames",
     "_double_vertex_measures",
@@ -89,6 +90,7 @@ class Mesh:
             _validate(vertices, faces)
             # Copies: editing the caller's arrays afterwards must not invalidate a cached factor.
             self._assign(vertices.clone(), faces.clone(), (0, len(vertices)), (0, len(faces)))
+            self._check_cells()
 
     def _assign(
         self,
@@ -103,6 +105,21 @@ class Mesh:
             vertex_offsets=vertex_offsets,
             face_offsets=face_offsets,
         )
+
+    def _check_cells(self) -> None:
+        """Raise for cells without measure, or one out of range.
+
+        Measures must be normal numbers in the mesh's dtype, and their squares in float64: norms of
+        area vectors pass through the squares.
+        """
+        _reject(cells.degenerate(self._corners, self._determinants), _flat(self.faces))
+        for quantity in (self._double_measures.square(), self._double_measures.to(self.dtype)):
+            range_ = torch.finfo(quantity.dtype)
+            if not ((quantity >= range_.tiny) & (quantity <= range_.max)).all():
+                raise MeshError(
+                    f"Mesh: {_measure(self.faces)}s leave the range of {self.dtype}; rescale the "
+                    "vertices"
+                )
 
     def __setattr__(self, name: str, value: object) -> NoReturn:
         raise AttributeError(f"Mesh is immutable: build a new Mesh instead of setting {name!r}")
@@ -165,6 +182,7 @@ class Mesh:
         _validate(vertices, self.faces)
         moved = object.__new__(Mesh)
         moved._assign(vertices.clone(), self.faces, self.vertex_offsets, self.face_offsets)
+        moved._check_cells()
         kept = {name: self.__dict__[name] for name in _OF_FACES if name in self.__dict__}
         moved.__dict__.update(kept)
         return moved
@@ -176,8 +194,9 @@ class Mesh:
         moved = object.__new__(Mesh)
         faces = self.faces if isinstance(target, torch.dtype) else self.faces.to(target)
         vertices = self.vertices.to(target)
-        _validate(vertices, faces)  # a narrower dtype can collapse faces
+        _validate(vertices, faces)
         moved._assign(vertices, faces, self.vertex_offsets, self.face_offsets)
+        moved._check_cells()  # a narrower dtype can collapse faces
         return moved
 
     # ---------------------------------------------------------------- geometry
@@ -188,14 +207,19 @@ class Mesh:
         return self.vertices.double()[self.faces]
 
     @constant_property
+    def _determinants(self) -> Float[Tensor, "m *D"]:
+        """Float64 measures times d!, signed, or as normal vectors (see `cells.determinants`)."""
+        return cells.determinants(self._corners)
+
+    @constant_property
     def _double_measures(self) -> Float[Tensor, "m"]:
         """Float64 measures, for operators assembled in double whatever the mesh's dtype."""
-        return cells.measures(self._corners)
+        return cells.measures(self._corners, self._determinants)
 
     @constant_property
     def _double_frames(self) -> Float[Tensor, "m D d"]:
         """Float64 frames (see `frames`)."""
-        return cells.frames(self._corners)
+        return cells.frames(self._corners, self._determinants)
 
     @constant_property
     def measures(self) -> Float[Tensor, "m"]:
@@ -269,7 +293,7 @@ class Mesh:
         self._require_triangles(name)
         if self.dim != 3:
             raise MeshError(f"{name} need a mesh in space: vertices have D = {self.dim}, not 3")
-        return cells.determinants(self._corners)
+        return self._determinants
 
     def _require_triangles(self, name: str) -> None:
         if self.cell_dim != 2:
@@ -425,7 +449,7 @@ class Mesh:
             raise MeshError(f"Mesh.cleaned: none of the {len(faces)} faces is usable")
 
         used = torch.zeros(len(vertices), dtype=torch.bool, device=vertices.device)
-        used[new_faces[keep].flatten()] = True
+        used[new_faces[keep]] = True
         new_index = _new_indices(used)
         mesh = Mesh(vertices[used], new_index[new_faces[keep]])
         return CleanedMesh(mesh, new_index[merged], _new_indices(keep))
@@ -531,25 +555,8 @@ def _validate(vertices: Tensor, faces: Tensor) -> None:
     finite = vertices.isfinite().all(dim=1)
     _reject(~finite, "with a coordinate that is not finite", ("vertex", "vertices"))
     used = torch.zeros(n, dtype=torch.bool, device=vertices.device)
-    used[faces.flatten()] = True
+    used[faces] = True
     _reject(~used, "that no face uses", ("vertex", "vertices"))
-    _reject(cells.degenerate(vertices.double()[faces]), _flat(faces))
-    _check_range(vertices, faces)
-
-
-def _check_range(vertices: Tensor, faces: Tensor) -> None:
-    """Measures must be normal numbers in the mesh's dtype, and their squares in float64.
-
-    Norms of area vectors pass through the squares.
-    """
-    measures = cells.measures(vertices.double()[faces])
-    for quantity in (measures.square(), measures.to(vertices.dtype)):
-        range_ = torch.finfo(quantity.dtype)
-        if not ((quantity >= range_.tiny) & (quantity <= range_.max)).all():
-            raise MeshError(
-                f"Mesh: {_measure(faces)}s leave the range of {vertices.dtype}; rescale the "
-                "vertices"
-            )
 
 
 def _measure(faces: Tensor) -> str:

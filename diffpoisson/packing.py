@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import scipy.spatial
 from jaxtyping import Float
 
 # Between charts, as a fraction of the side of a square of all boxes' area: 10 pixels in 1024.
@@ -30,8 +29,10 @@ def _lying(points: np.ndarray) -> np.ndarray:
 
     One side of such a box lies on an edge of the convex hull (Freeman and Shapira 1975).
     """
+    from scipy.spatial import ConvexHull  # noqa: PLC0415  (quick to use, slow to import)
+
     # Joggled, since slivers are flat to Qhull: the hull only supplies directions.
-    hull = points[scipy.spatial.ConvexHull(points, qhull_options="QJ").vertices]
+    hull = points[ConvexHull(points, qhull_options="QJ").vertices]
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     length = np.hypot(x, y)
     turns = np.array([[x, y], [-y, x]]) / length  # (2, 2, edges): each edge to the x-axis

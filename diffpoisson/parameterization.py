@@ -306,6 +306,7 @@ def _mean_energy(mesh: Mesh) -> Callable[[Float[np.ndarray, "n 2"]], float]:
     gradient = gradient_operator(mesh).matrix
     weights = (mesh._double_measures / mesh._double_measures.sum()).cpu().numpy()
 
+    @np.errstate(over="ignore", invalid="ignore")  # far from any unit the energy is infinite
     def energy(points: np.ndarray) -> float:
         u, v = (gradient @ points).reshape(2, -1, 2)  # columns of the Jacobians
         det = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

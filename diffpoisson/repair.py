@@ -16,7 +16,6 @@ import math
 import numbers
 
 import numpy as np
-import scipy.optimize
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -100,11 +99,10 @@ def clamp_flips(
     require_instances("clamp_flips", [solver], PoissonSolver)
     _require_map("clamp_flips", solver.mesh, uv)
     require_integer("clamp_flips", "max_rounds", max_rounds, 0)
-    for rounds in range(max_rounds + 1):
-        J = jacobians(solver.mesh, uv)
-        if rounds == max_rounds or not flipped(J).any():
-            break
+    rounds = 0
+    while rounds < max_rounds and flipped(J := jacobians(solver.mesh, uv)).any():
         uv = solver(clamp_singular_values(J, *limits))
+        rounds += 1
     return uv, rounds
 
 
@@ -124,60 +122,63 @@ def untangle(
 
     Raises:
         TypeError: arguments of other types.
-        ValueError: uv is not (n, 2), or a negative number of rounds or iterations.
+        ValueError: uv is not (n, 2), a negative number of rounds, or not one iteration.
     """
     require_mesh("untangle", mesh)
     _require_map("untangle", mesh, uv)
     require_integer("untangle", "max_rounds", max_rounds, 0)
-    require_integer("untangle", "iterations", iterations, 0)
-    areas = mesh._double_measures / mesh._double_measures.sum()
-    x = uv.detach().double()
-    for rounds in range(max_rounds + 1):
-        worst = _worst(mesh, x)
-        if worst > 0 or rounds == max_rounds:
-            break
-        x = _descend(mesh, areas, x, _epsilon(worst), iterations)
+    require_integer("untangle", "iterations", iterations, 1)
+    x, rounds = uv.detach().double(), 0
+    while rounds < max_rounds and (worst := _worst(mesh, x)) <= 0:
+        x = _descend(mesh, x, _epsilon(worst), iterations)
+        rounds += 1
     return x.to(uv.dtype), rounds
 
 
 def _epsilon(worst: float) -> float:
-    """Garanzha et al.'s rule: a fraction of the deepest flip, with a floor for flat faces."""
-    return math.hypot(1e-6, 0.04 * min(worst, 0))
+    """As Garanzha et al., whose fraction of the deepest flip is 0.2; a floor for flat faces."""
+    return math.hypot(1e-6, 0.04 * worst)
 
 
 def _worst(mesh: Mesh, uv: Tensor) -> float:
     return float(determinant(jacobians(mesh, uv)).min())
 
 
-def _energy(mesh: Mesh, areas: Tensor, uv: Tensor, epsilon: float) -> Float[Tensor, ""]:
+def _energy(mesh: Mesh, uv: Tensor, epsilon: float) -> Float[Tensor, ""]:
     J = jacobians(mesh, uv)
+    areas = mesh._double_measures / mesh._double_measures.sum()
     return (areas * (mips(J, epsilon) + area_distortion(J, epsilon))).sum()
 
 
-def _descend(
-    mesh: Mesh, areas: Tensor, uv: Tensor, epsilon: float, iterations: int
-) -> Float[Tensor, "n 2"]:
+def _descend(mesh: Mesh, uv: Tensor, epsilon: float, iterations: int) -> Float[Tensor, "n 2"]:
     """L-BFGS at one ε, until nothing flips."""
+    # The unit of length to SciPy, whose tolerance of gradients is absolute.
+    unit = mesh._double_measures.sum().sqrt()
+
+    def map_of(x: np.ndarray) -> Tensor:
+        return unit * torch.from_numpy(x).view_as(uv).to(unit.device)
 
     def value_and_gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
-        point = torch.from_numpy(x).view_as(uv).requires_grad_()
-        energy = _energy(mesh, areas, point, epsilon)
+        point = map_of(x).requires_grad_()
+        energy = _energy(mesh, point, epsilon)
         (gradient,) = torch.autograd.grad(energy, point)
-        return float(energy.detach()), gradient.numpy().ravel()
+        return float(energy.detach()), (unit * gradient).view(-1).cpu().numpy()
 
     def stop_if_valid(x: np.ndarray) -> None:
-        if _worst(mesh, torch.from_numpy(x).view_as(uv)) > 0:
+        if _worst(mesh, map_of(x)) > 0:
             raise StopIteration
+
+    import scipy.optimize  # noqa: PLC0415  (a twentieth of the time to import the package)
 
     result = scipy.optimize.minimize(
         value_and_gradient,
-        uv.numpy().ravel(),
+        (uv / unit).view(-1).cpu().numpy(),
         jac=True,
         method="L-BFGS-B",
         callback=stop_if_valid,
         options={"maxiter": iterations, "maxcor": 10},
     )
-    return torch.from_numpy(result.x).view_as(uv)
+    return map_of(result.x)
 
 
 def _require_map(operation: str, mesh: Mesh, uv: Tensor) -> None:

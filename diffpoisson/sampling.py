@@ -53,16 +53,16 @@ def sample_surface(
     """
     require_mesh("sample_surface", mesh)
     require_integer("sample_surface", "n_samples", n_samples, least=0)
+    mesh._require_triangles("sample_surface: areas")
+    # Inverting the cumulative area has no limit on the number of faces, unlike torch.multinomial.
+    cumulative = mesh._double_measures.cumsum(0)
 
     def uniform() -> Tensor:
-        like = mesh.areas.new_empty(n_samples, dtype=torch.float64)
-        return like.uniform_(generator=generator)
+        return cumulative.new_empty(n_samples).uniform_(generator=generator)
 
-    # Inverting the cumulative area has no limit on the number of faces, unlike torch.multinomial.
-    cumulative = mesh.areas.double().cumsum(0)
-    # rand() < 1, but its product with the total may round up to the total: hence the clamp.
+    # Doubles below 1 are at most 1 - 2⁻⁵³: such parts of the total round to less than the total.
     heights = uniform() * cumulative[-1]
-    faces = torch.searchsorted(cumulative, heights, right=True).clamp(max=mesh.n_faces - 1)
+    faces = torch.searchsorted(cumulative, heights, right=True)
     # The square root makes a point's distance from corner 0 uniform in area (Osada et al. 2002, eq.
     # 1).
     root, t = uniform().sqrt(), uniform()

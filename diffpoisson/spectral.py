@@ -73,10 +73,7 @@ def laplacian_eigenpairs(
     if wanted <= 0:
         pairs = (np.zeros(0), np.zeros((n, 0)))
     elif 2 * wanted + 1 < n - zeros:
-        if intrinsic_delaunay:
-            inverse = _pinned_inverse(mesh)
-        else:
-            inverse = (solver or PoissonSolver(mesh)).solve_laplacian
+        inverse = _inverse(mesh, None if intrinsic_delaunay else solver or PoissonSolver(mesh))
         pairs = _lanczos(mesh, inverse, areas, wanted)
     else:  # Lanczos keeps 2k + 1 vectors; near n, the dense solver is exact and faster
         pairs = _dense(laplacian(mesh, intrinsic_delaunay=intrinsic_delaunay), areas, zeros)
@@ -98,8 +95,8 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
         return mesh.vertex_measures
-    areas = mesh.areas.double()[:, None]
-    shares = areas * _voronoi_shares(mesh.vertices.double()[mesh.faces])
+    mesh._require_triangles("lumped_mass: Voronoi areas")
+    shares = mesh._double_measures[:, None] * _voronoi_shares(mesh._corners)
     total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
     return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)
 
@@ -152,7 +149,7 @@ def wave_kernel_signature(
     )
     signature = vectors[:, mesh.n_components :].double() ** 2 @ weights
     if scale_invariant:
-        signature = signature * mesh.measures.double().sum()
+        signature = signature * mesh._double_measures.sum()
     return signature.to(mesh.dtype)
 
 
@@ -230,45 +227,52 @@ def _constants(mesh: Mesh, areas: np.ndarray) -> np.ndarray:
     return np.eye(len(totals))[labels] / np.sqrt(totals)
 
 
-def _pinned_inverse(mesh: Mesh) -> Callable[[Tensor], Tensor]:
-    """Solves with the intrinsic Delaunay Laplacian, one vertex of each component at zero."""
-    _, anchors = np.unique(mesh.components.cpu().numpy(), return_index=True)
-    free = np.setdiff1d(np.arange(mesh.n_vertices), anchors)
-    factor = CholeskyFactor(laplacian(mesh, intrinsic_delaunay=True)[free][:, free])
+def _inverse(mesh: Mesh, solver: PoissonSolver | None) -> Callable[[np.ndarray], np.ndarray]:
+    """Solves with the solver's Laplacian, or the intrinsic Delaunay one, zero at some vertices."""
+    if solver is not None:
+        factor, free = solver._matrices.inverse, solver.constraints.free.cpu().numpy()
+    else:
+        _, anchors = np.unique(mesh.components.cpu().numpy(), return_index=True)
+        free = np.setdiff1d(np.arange(mesh.n_vertices), anchors)
+        L = laplacian(mesh, intrinsic_delaunay=True)
+        factor = CholeskyFactor(L[free][:, free], mesh.device)
 
-    def solve(b: Tensor) -> Tensor:
-        x = torch.zeros_like(b)
-        x[free] = factor.multiply(b[free])
+    def solve(b: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        x = np.zeros_like(b)
+        column = torch.from_numpy(b[free])[:, None].to(mesh.device)
+        x[free] = factor.multiply(column)[:, 0].cpu().numpy()
         return x
 
     return solve
 
 
 def _lanczos(
-    mesh: Mesh, inverse: Callable[[Tensor], Tensor], areas: np.ndarray, k: int
+    mesh: Mesh, inverse: Callable[[np.ndarray], np.ndarray], areas: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The k smallest non-zero eigenpairs by shift-invert Lanczos at zero, ascending."""
-    n = mesh.n_vertices
-    null = _constants(mesh, areas)
+    """The k smallest non-zero eigenpairs, ascending.
 
-    def pseudo_inverse(b: np.ndarray) -> np.ndarray:
-        # Drop the part outside the range of L, solve with one vertex per component at zero, and
-        # move the solution to mean zero: both projections together keep the operator symmetric.
-        b = b - areas * (null @ (null.T @ b))
-        x = inverse(torch.from_numpy(b)[:, None]).numpy()[:, 0]
-        return x - null @ (null.T @ (areas * x))
+    By Lanczos on M½ L⁺ M½, whose largest eigenvalues are 1/λ, of eigenvectors M½ φ: a standard
+    problem, without products by M between the solves.
+    """
+    root = np.sqrt(areas)
+    null = root[:, None] * _constants(mesh, areas)  # M½ 1, orthonormal
 
-    start = np.random.default_rng(0).standard_normal(n)  # ARPACK's own start is not reproducible
+    def pseudo_inverse(y: np.ndarray) -> np.ndarray:
+        # Both projections together keep the operator symmetric: onto the range of L, where there is
+        # a solution, and to mean zero, whichever vertices the factor leaves at zero.
+        b = root * (y - null @ (null.T @ y))
+        z = root * inverse(b)
+        return z - null @ (null.T @ z)
+
+    start = np.random.default_rng(0).standard_normal(len(root))  # ARPACK's own differs every time
     values, vectors = scipy.sparse.linalg.eigsh(
-        sp.csr_matrix((n, n)),  # shift-invert mode at zero needs only L⁻¹ and M
+        scipy.sparse.linalg.LinearOperator((len(root),) * 2, pseudo_inverse, dtype=np.float64),
         k,
-        M=sp.diags(areas),
-        sigma=0.0,
+        which="LM",
         v0=start,
-        OPinv=scipy.sparse.linalg.LinearOperator((n, n), matvec=pseudo_inverse, dtype=np.float64),
     )
-    order = np.argsort(values)
-    return values[order], vectors[:, order]
+    order = np.argsort(-values)
+    return 1 / values[order], vectors[:, order] / root[:, None]
 
 
 def _voronoi_shares(corners: Float[Tensor, "m 3 D"]) -> Float[Tensor, "m 3"]:

@@ -103,7 +103,7 @@ class UVMap:
     @cached_property
     def certified(self) -> bool:
         """Whether the map is one-to-one for certain: every chart is, and their boxes are apart."""
-        triangles = self.uv[self.mesh.faces].cpu().double().numpy()
+        triangles = self.uv[self.mesh.faces].cpu().numpy()
         charts = [triangles[chart.faces.cpu().numpy()] for chart in self.charts]
         low = np.stack([corners.min(axis=(0, 1)) for corners in charts])
         high = np.stack([corners.max(axis=(0, 1)) for corners in charts])

@@ -420,8 +420,8 @@ def constant_face_weights(patch):
 def unsigned_volumes(patch):
     """Gradients on inverted tetrahedra have the wrong sign."""
 
-    def hats(original, corners, frames):
-        values = original(corners, frames)
+    def hats(original, corners, *rest):
+        values = original(corners, *rest)
         if corners.shape[1] == 3:
             return values
         return values * cells.determinants(corners).sign()[:, None, None]
@@ -439,8 +439,8 @@ def parallelepipeds(patch):
 def swapped_facets(patch):
     """The gradients of two corners of every tetrahedron are exchanged."""
 
-    def hats(original, corners, frames):
-        values = original(corners, frames)
+    def hats(original, corners, *rest):
+        values = original(corners, *rest)
         return values[..., [1, 0, 2, 3]] if corners.shape[1] == 4 else values
 
     wrap(patch, cells, "hat_gradients", hats)

@@ -140,15 +140,15 @@ def double_areas(patch):
 @fault("scale")
 def area_epsilon(patch):
     """A small number is added to areas, to avoid division by zero."""
-    wrap(patch, cells, "measures", lambda f, corners: f(corners) + 1e-8)
+    wrap(patch, cells, "measures", lambda f, *cell: f(*cell) + 1e-8)
 
 
 @fault("gradient_against_edge_basis")
 def unsigned_planar_areas(patch):
     """The orientation of clockwise planar faces is lost in the gradient."""
 
-    def hats(original, corners, frames):
-        values = original(corners, frames)
+    def hats(original, corners, *rest):
+        values = original(corners, *rest)
         if corners.shape[2] == 3:
             return values
         return values * cells.determinants(corners).sign()[:, None, None]

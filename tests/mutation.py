@@ -8,7 +8,7 @@ each mutant: it exchanges the code of the changed functions, and runs the tests 
 changed line, first the fastest on each path through the file, until one fails. A mutant survives if
 all pass, or if none fails in `--seconds` of tests. What runs at import (defaults, class bodies,
 constants) can't be exchanged: such mutants are written to a copy of the repository, and the tests
-collected anew. The same command goes on where it was interrupted; mutants of a file that has
+collected anew. The same command goes on where it was interrupted; mutants of a function that has
 changed since are forgotten. `--again` runs the survivors again, after tests were added, but for
 those that `mutation_verdicts.toml` argues away.
 """
@@ -36,7 +36,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from tqdm import tqdm
@@ -84,9 +84,17 @@ ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
 # ------------------------------------------------------- mutants
 
 
+Key = tuple[str, str, int]
+
+
 @dataclass(frozen=True)
 class Mutant:
-    """One change: where, what, and the lines of the statement that it is in."""
+    """One change: where, what, and the lines of the statement that it is in.
+
+    Attributes:
+        unit: hash of the function or method, or of the statement outside of any.
+        index: its number among the mutants of that unit.
+    """
 
     file: str
     line: int
@@ -94,10 +102,12 @@ class Mutant:
     change: str
     statement: str
     lines: range
+    unit: str
+    index: int
 
     @property
-    def key(self) -> tuple[str, int, int, str]:
-        return self.file, self.line, self.column, self.change
+    def key(self) -> Key:
+        return self.file, self.unit, self.index
 
 
 def verdicts() -> dict[str, dict[str, str]]:
@@ -116,30 +126,45 @@ def named(record: dict[str, Any]) -> str:
 
 def mutants(file: str, text: str) -> Iterator[Mutant]:
     """All mutants of a file, in the order of its text."""
-    for node, statement, change, _ in _all_changes(ast.parse(text)):
-        place = node.lineno, node.col_offset
-        yield Mutant(file, *place, change, _short(statement), _own_lines(statement))
+    count: Counter[str] = Counter()
+    hashes: dict[Any, str] = {}
+    for place, change, _ in _all_changes(ast.parse(text)):
+        node, statement = place.node, place.statement
+        if place.unit not in hashes:
+            hashes[place.unit] = _hash(ast.unparse(place.unit))
+        unit = hashes[place.unit]
+        where = file, node.lineno, node.col_offset
+        yield Mutant(*where, change, _short(statement), _own_lines(statement), unit, count[unit])
+        count[unit] += 1
 
 
 def mutated(mutant: Mutant, text: str) -> ast.Module:
     """The file with one change."""
     tree = ast.parse(text)
-    for node, _, change, do in _all_changes(tree):
+    for (node, *_), change, do in _all_changes(tree):
         if (node.lineno, node.col_offset, change) == (mutant.line, mutant.column, mutant.change):
             do()
             return ast.fix_missing_locations(tree)
     raise ValueError(f"no such mutant: {mutant}")
 
 
-def _all_changes(tree: ast.Module) -> Iterator[tuple[Any, Any, str, Callable[[], None]]]:
-    """Node, its statement, a change and what makes it."""
-    for node, statement in _code(tree, None):
-        for change, do in _changes(node):
-            yield node, statement, change, do
+class _Place(NamedTuple):
+    """A node, its statement, and the function or method, or else the statement, that it is in."""
+
+    node: Any
+    statement: Any
+    unit: Any
 
 
-def _code(node: ast.AST, statement: Any) -> Iterator[tuple[Any, Any]]:
-    """What runs, and its statement: no annotations, no documentation, no messages."""
+def _all_changes(tree: ast.Module) -> Iterator[tuple[_Place, str, Callable[[], None]]]:
+    """A place, a change and what makes it."""
+    for place in _code(tree, None, None):
+        for change, do in _changes(place.node):
+            yield place, change, do
+
+
+def _code(node: ast.AST, statement: Any, function: Any) -> Iterator[_Place]:
+    """What runs: no annotations, no documentation, no messages."""
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "type_comment"):
             continue
@@ -149,9 +174,10 @@ def _code(node: ast.AST, statement: Any) -> Iterator[tuple[Any, Any]]:
             if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
                 continue
             inner = child if isinstance(child, ast.stmt) else statement
+            around = function or (child if isinstance(child, ast.FunctionDef) else None)
             if hasattr(child, "lineno"):
-                yield child, inner
-            yield from _code(child, inner)
+                yield _Place(child, inner, around or inner)
+            yield from _code(child, inner, around)
 
 
 def _own_lines(statement: Any) -> range:
@@ -383,24 +409,21 @@ class Run:
         self.copy, self.seconds, self.state = copy, seconds, state
         self.package = copy / "diffpoisson"
         self.texts = {file: (self.package / f"{file}.py").read_text() for file in FILES}
-        self.hashes = {file: _hash(text) for file, text in self.texts.items()}
         everything = [m for file, text in self.texts.items() for m in mutants(file, text)]
         self.all = [mutant for mutant in everything if mutant.file in files]
-        self.existing = {mutant.key for mutant in everything}
+        self.existing = {mutant.key: mutant for mutant in everything}
         self.population = Counter(mutant.file for mutant in everything)
-        self.done: dict[tuple[str, int, int, str], dict[str, Any]] = {}
+        self.done: dict[Key, dict[str, Any]] = {}
         self.load()
 
     def load(self) -> None:
-        """What was done before, unless the file has changed."""
+        """What was done before, of what has not changed since."""
         if not self.state.exists():
             return
-        earlier = json.loads(self.state.read_text())
-        for record in earlier["mutants"]:
-            file = record["file"]
-            key = file, record["line"], record["column"], record["change"]
-            if key in self.existing and earlier["sources"][file] == self.hashes[file]:
-                self.done[key] = record
+        for record in json.loads(self.state.read_text())["mutants"]:
+            mutant = self.existing.get((record["file"], record["unit"], record["index"]))
+            if mutant is not None:
+                self.done[mutant.key] = record | {"line": mutant.line}
 
     def forget_survivors(self) -> None:
         """But for those that are argued away."""
@@ -444,8 +467,9 @@ class Run:
         outcome = "hung" if code == "hung" else "survived" if code == 0 else "killed"
         self.done[mutant.key] = {
             "file": mutant.file,
+            "unit": mutant.unit,
+            "index": mutant.index,
             "line": mutant.line,
-            "column": mutant.column,
             "change": mutant.change,
             "statement": mutant.statement,
             "tests": len(tests),
@@ -453,11 +477,8 @@ class Run:
         }
         if outcome == "survived":
             tqdm.write(f"{mutant.file}.py:{mutant.line}: {mutant.change}  in  {mutant.statement}")
-        report = {
-            "sources": dict(sorted(self.hashes.items())),
-            "population": dict(sorted(self.population.items())),
-            "mutants": [self.done[key] for key in sorted(self.done)],
-        }
+        records = sorted(self.done.values(), key=lambda r: (r["file"], r["line"], r["index"]))
+        report = {"population": dict(sorted(self.population.items())), "mutants": records}
         self.state.write_text(json.dumps(report, indent=1) + "\n")
 
 

@@ -115,6 +115,7 @@ SOLVER = dp.PoissonSolver(MESH)
         (lambda: SOLVER(FIELD.numpy()), "PoissonSolver: R must be a torch tensor"),
         (lambda: SOLVER(FIELD, vertices=[0]), "PoissonSolver: vertices must be a torch tensor"),
         (lambda: SOLVER(FIELD, face_weights=1), "PoissonSolver: face_weights must be a torch"),
+        (lambda: SOLVER(FIELD, translations=[0]), "PoissonSolver: translations must be a torch"),
         (lambda: SOLVER(FIELD, refinements=1.5), "PoissonSolver: refinements must be an integer"),
         (lambda: SOLVER.solve_laplacian([0]), "solve_laplacian: b must be a torch tensor"),
         (
@@ -151,6 +152,8 @@ def test_refinements():
     for given in (R, torch.stack([R, 2 * R])):
         expected = solver(given, **images)
         torch.testing.assert_close(solver(given, **images, refinements=2), expected)
+    free = dp.PoissonSolver(mesh)
+    torch.testing.assert_close(free(R, refinements=1), free(R))
     with pytest.raises(ValueError, match="refinements know the mesh's own geometry only"):
         solver(R, **images, vertices=mesh.vertices, refinements=1)
     with pytest.raises(ValueError, match="refinements must be at least 0, got -1"):

@@ -63,7 +63,7 @@ def test_needles_lose_no_digits(kind):
             )
         exact = np.sqrt(float(square)) / (2 if len(gram) == 2 else 6)
         # Coordinates of order one carry roundings of 1e-16 on edges of 1e-7: none is added.
-        assert cells.measures(cell[None]).item() == pytest.approx(exact, rel=1e-14)
+        assert cells.measures(cell[None]).item() == pytest.approx(exact, rel=1e-14, abs=0)
 
 
 @kinds
@@ -91,6 +91,21 @@ def test_flat_but_not_degenerate():
     assert not cells.degenerate(solid).any()
     solid[0, 3, 2] = 1e-17
     assert cells.degenerate(solid).all()
+
+
+@kinds
+@pytest.mark.parametrize("excess", [-0.03, 0.03])
+def test_degenerate_up_to_the_rounding_error_of_a_determinant(kind, excess):
+    """8 units of roundoff times the lengths of the shortest edges, 16 for tetrahedra; exactly."""
+    count, dim = KINDS[kind]
+    u = 2.0**-53 * (1 + excess)
+    if count == 3:  # edges of length 1/2 at the last corner, whose determinant is h exactly
+        cell = [[0, 0, 0][:dim], [1, 0, 0][:dim], [0.5, 8 * u / 4, 0][:dim]]
+    else:  # edges of length 1 at the first one
+        cell = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.6, -0.8, 16 * u]]
+    for turn in range(count):
+        turned = torch.tensor([cell], dtype=torch.float64).roll(turn, dims=1)
+        assert cells.degenerate(turned).item() == (excess < 0)
 
 
 @kinds

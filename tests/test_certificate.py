@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from fractions import Fraction
 
 import numpy as np
@@ -11,8 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.certificate import boxes_apart, certify, count_flips, is_simple, orientations
+from diffpoisson.certificate import (
+    _segments_meet,
+    boxes_apart,
+    certify,
+    count_flips,
+    is_simple,
+    orientations,
+)
 from tests import meshes
+
+MESH = dp.Mesh(*meshes.planar_disk(0, 4))
 
 
 def exact_orientation(triangle) -> int:
@@ -38,6 +48,19 @@ def test_exactly_collinear_and_coincident_corners_are_zero():
         [[[0, 0], [1, 1], [3, 3]], [[0.1, 0.1], [0.1, 0.1], [5, 7]], [[0, 0], [1, 0], [0, 1]]]
     )
     assert orientations(triangles).tolist() == [0, 0, 1]
+
+
+def test_orientation_where_rounding_errs_by_more_than_half_of_its_bound():
+    """The computed area is negative, and 1.7u times the sum of its products' magnitudes."""
+    triangle = [
+        [1.2906523754482964, 1.6573907708612263],
+        [21.956381316952438, 29.204664352507585],
+        [4.479496218014516, 5.908097532232617],
+    ]
+    (ax, ay), (bx, by), (cx, cy) = triangle
+    assert (ax - cx) * (by - cy) < (ay - cy) * (bx - cx)
+    assert exact_orientation(triangle) == 1
+    assert orientations(np.array([triangle])) == [1]
 
 
 def brute_force_simple(polygon: np.ndarray) -> bool:
@@ -78,6 +101,34 @@ def test_simplicity_against_brute_force(seed, n, grid):
     polygon = rng.integers(0, 5, (n, 2)).astype(float) if grid else rng.standard_normal((n, 2))
     assert is_simple(polygon) == brute_force_simple(polygon)
     assert is_simple(polygon, at_once=2) == is_simple(polygon)
+
+
+def test_simplicity_of_all_small_triangles():
+    """Neighbouring edges that fold back, of length zero, or both."""
+    points = np.argwhere(np.ones((3, 2))).astype(float)
+    for triangle in itertools.product(points, repeat=3):
+        assert is_simple(np.array(triangle)) == brute_force_simple(np.array(triangle))
+
+
+def test_all_pairs_of_small_segments():
+    """They meet where they cross, or where an end of one is on the other."""
+    points = np.argwhere(np.ones((3, 3)))
+    a, b, c, d = points[np.array(list(itertools.product(range(9), repeat=4)))].swapaxes(0, 1)
+
+    def side(p, q, r):
+        return np.sign((q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0])
+
+    def on(p, q, r):
+        between = (np.minimum(p, q) <= r) & (r <= np.maximum(p, q))
+        return between.all(axis=1) & (side(p, q, r) == 0)
+
+    crossing = (side(a, b, c) * side(a, b, d) == -1) & (side(c, d, a) * side(c, d, b) == -1)
+    meet = crossing | on(a, b, c) | on(a, b, d) | on(c, d, a) | on(c, d, b)
+    boxes_meet = (np.minimum(a, b) <= np.maximum(c, d)) & (np.minimum(c, d) <= np.maximum(a, b))
+    asked = boxes_meet.all(axis=1)
+    assert asked[meet].all()
+    actual = _segments_meet(*(x[asked].astype(float) for x in (a, b, c, d)))
+    assert actual.tolist() == meet[asked].tolist()
 
 
 def test_regular_polygons_are_simple_and_stars_are_not():
@@ -132,6 +183,32 @@ def test_distortion_of_a_stretch_on_one_side():
     assert certificate.energy == pytest.approx(((1 + 1 + 1 + 1) + (4 + 1 + 1 / 4 + 1)) / 2)
 
 
+def test_single_precision_is_certified_like_its_copy_in_double():
+    """Where float32's own arithmetic has wrong signs: corners next to lines through two others."""
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((2, 500, 2)).astype(np.float32)
+    c = a + rng.uniform(-0.5, 1.5, (500, 1)).astype(np.float32) * (b - a)
+    triangles = np.stack([a, b, c], axis=1)
+    mesh = dp.Mesh(rng.standard_normal((1500, 3)), np.arange(1500).reshape(-1, 3))
+    flips = count_flips(mesh, torch.from_numpy(triangles).flatten(0, 1))
+    assert flips == sum(exact_orientation(t) <= 0 for t in triangles)
+
+    square = dp.Mesh(*meshes.planar_disk(0, 2))
+    loop = square.boundary_loops[0]
+    for polygon in (  # the third corner is next to the first edge, on one side or the other
+        [[1.4285715, 8.857142], [8.571428, 1.5714285], [2.8154173, 7.4425597], [7.714286, 13]],
+        [
+            [6.142857, 0.42857143],
+            [8.142858, 5.714286],
+            [7.4269304, 3.8221931],
+            [13.142858, 12.142858],
+        ],
+    ):
+        uv = torch.empty(4, 2)
+        uv[loop] = torch.tensor(polygon)
+        assert certify(square, uv) == certify(square, uv.double())
+
+
 def test_single_precision_is_certified_as_it_stands():
     """Corners that float32 puts on one line are flat, though their originals were not."""
     mesh = dp.Mesh(np.array([[0.0, 0], [1, 0], [0.5, 1]]), np.array([[0, 1, 2]]))
@@ -149,3 +226,52 @@ def test_boxes_against_all_pairs(seed, n, grid):
         (high[i] < low[j]).any() or (high[j] < low[i]).any() for i in range(n) for j in range(i)
     )
     assert boxes_apart(low, high) == apart
+
+
+def test_all_pairs_of_small_boxes():
+    corners = list(np.argwhere(np.ones((3, 3))).astype(float))
+    boxes = [(p, q) for p, q in itertools.product(corners, repeat=2) if (p <= q).all()]
+    for (low, high), (other_low, other_high) in itertools.product(boxes, repeat=2):
+        apart = (high < other_low).any() or (other_high < low).any()
+        assert boxes_apart(np.stack([low, other_low]), np.stack([high, other_high])) == apart
+
+
+@pytest.mark.parametrize("scale", [1e-170, 1, 1e170])
+def test_certificates_at_any_scale(scale):
+    """Where products of coordinates underflow or overflow, signs are exact all the same."""
+    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
+    uv = mesh.vertices * scale
+    assert orientations(uv[mesh.faces].numpy()).tolist() == [1] * mesh.n_faces
+    assert orientations(uv[mesh.faces].flip(1).numpy()).tolist() == [-1] * mesh.n_faces
+    square = np.array([[0, 0], [1, 0], [2, 0], [2, 2], [0, 2.0]]) * scale
+    assert is_simple(square)
+    square[2] = scale * np.array([0.5, 0])  # folds back onto the edge before it
+    assert not is_simple(square)
+
+
+def test_maps_that_are_not_finite_get_no_certificate():
+    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
+    uv = mesh.vertices.clone()
+    uv[3, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"^certify: uv has entries that are not finite"):
+        dp.certify(mesh, uv)
+    assert (orientations(uv[mesh.faces].numpy()) == 0).tolist() == (mesh.faces == 3).any(1).tolist()
+
+
+def test_certificates_need_no_graph():
+    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
+    assert dp.certify(mesh, mesh.vertices.clone().requires_grad_()).injective
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ((None, MESH.vertices), TypeError, "expected a diffpoisson.Mesh"),
+        ((MESH, MESH.vertices.numpy()), TypeError, "uv must be a torch tensor"),
+        ((MESH, MESH.vertices.half()), TypeError, "uv must be float32 or float64"),
+        ((MESH, MESH.vertices[1:]), ValueError, r"expected uv of shape \(n=16, 2\), got \(15, 2\)"),
+    ],
+)
+def test_certificates_name_what_they_refuse(arguments, kind, message, unchecked):
+    with pytest.raises(kind, match="^certify: " + message):
+        certify(*arguments)

@@ -193,6 +193,10 @@ def test_single_precision():
     assert phi.dtype == v.grad.dtype == torch.float32
     assert_near(phi.detach(), expected.detach(), 1e-6)
     assert_near(v.grad, w.grad, 1e-5)
+    turns = field(mesh, seed=1).float()
+    phi = solved(single, R.float(), {"transforms": turns}, **halved)
+    expected = solved(rounded, turns.double() @ R.float().double(), **doubled)
+    assert torch.equal(phi, expected.float())
 
 
 def test_update_keeps_what_depends_on_the_faces():
@@ -414,6 +418,38 @@ def test_a_number_is_not_rounded(unchecked):
         assert torch.equal(given(R, handles=q), expected(R, handles=q))
 
 
+def test_numbers_of_any_width():
+    """Indices of 32 bits and weights of single precision are converted, exactly."""
+    mesh = dp.Mesh(*meshes.disk())
+    R = field(mesh)
+    pins, handles = torch.tensor([5, 1]), torch.tensor([3, 7])
+    q = torch.eye(3, dtype=torch.float64)[:2]
+    strengths = torch.tensor([0.3, 2])
+    weights = torch.arange(mesh.n_faces, dtype=torch.float32) / 7 + 1
+
+    def solution(indices, reals):
+        options = {"handle_weights": strengths.to(reals), "face_weights": weights.to(reals)}
+        solver = dp.PoissonSolver(
+            mesh, pins=pins.to(indices), handles=handles.to(indices), **options
+        )
+        given = {"pins": q, "handles": 2 * q}
+        assert solver.constraints.face_weights.dtype == torch.float64
+        union = dp.PoissonSolver.concatenate([solver])
+        return union(R, **given), solver(R, **given, face_weights=weights.to(reals))
+
+    expected = solution(torch.int64, torch.float64)
+    for actual, exact in zip(solution(torch.int32, torch.float32), expected, strict=True):
+        assert torch.equal(actual, exact)
+
+
+def test_handles_are_of_strength_one_by_default():
+    mesh, handles = dp.Mesh(*meshes.disk()), torch.tensor([3, 7])
+    R, q = field(mesh), torch.ones(2, 3, dtype=torch.float64)
+    default = dp.PoissonSolver(mesh, handles=handles)
+    one = dp.PoissonSolver(mesh, handles=handles, handle_weights=1.0)
+    assert torch.equal(default(R, handles=q), one(R, handles=q))
+
+
 @pytest.mark.parametrize("weight", [2.0, 0.5])
 def test_uniform_face_weights_count_against_handles(weight):
     """Face weights w and handles of strength w a are faces without weights and handles a."""
@@ -436,3 +472,4 @@ def test_editing_a_gauge_mask_afterwards_changes_nothing():
     mask[:] = True
     assert torch.equal(solver(R), expected)
     assert_near(solver.update(mesh.vertices)(R), expected, SOLVE)
+    assert_near(dp.PoissonSolver.concatenate([solver])(R), expected, SOLVE)

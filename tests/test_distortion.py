@@ -343,6 +343,13 @@ def test_regularised_determinant_does_not_cancel():
     assert chi.item() == pytest.approx(2.5e-13, rel=1e-12, abs=0)
 
 
+def test_epsilon_up_to_the_range_of_the_dtype():
+    J, largest = torch.eye(2), torch.finfo(torch.float32).max
+    assert_near(dp.area_distortion(J, largest), torch.tensor(4 / largest), 1e-6)
+    with pytest.raises(ValueError, match=r"epsilon = 6\.8\S+ exceeds the range of torch\.float32"):
+        dp.area_distortion(J, 2 * largest)
+
+
 def test_negative_epsilon_raises(unchecked):
     for name in BARRIERS:
         with pytest.raises(ValueError, match="epsilon must be finite and not negative, got -1"):
@@ -368,6 +375,22 @@ def test_derivatives(name, c, epsilon):
 
     assert gradcheck(function, J.requires_grad_(), rtol=1e-5)
     assert gradgradcheck(function, J, rtol=1e-4, atol=1e-4)
+
+
+def test_second_derivatives_at_isometries():
+    """At a rotation Q, of Q (1 + E): those of ‖sym E‖² and, without its trace, of conformal ones.
+
+    There σ₁ - σ₂, of which `lscm` is a square, has a kink.
+    """
+    Q, E = rotation(0.7), random_jacobians(2)
+    sym = (E + E.mT) / 2
+    traceless = sym - sym.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(2)
+    for energy, part in ((dp.arap, sym), (dp.lscm, traceless)):
+        t = torch.zeros(len(E), dtype=torch.float64, requires_grad=True)
+        value = energy(Q @ (torch.eye(2) + t[:, None, None] * E))
+        (first,) = torch.autograd.grad(value.sum(), t, create_graph=True)
+        (second,) = torch.autograd.grad(first.sum(), t)
+        assert_near(second, 2 * part.square().sum((1, 2)), 1e-13)
 
 
 # ------------------------------------------------------- shapes and dtypes
@@ -432,6 +455,15 @@ def random_values(count: int, *, flips: bool, seed: int = 0) -> torch.Tensor:
     if flips:
         values[:, 2] *= rng.choice([-1, 1], count)
     return torch.from_numpy(values)
+
+
+@pytest.mark.parametrize("size", [1e-120, 1e-30, 1e120])
+def test_the_sign_of_a_volume_does_not_depend_on_its_size(size):
+    """Where the determinant itself would under- or overflow."""
+    dtype = torch.float32 if size == 1e-30 else torch.float64
+    J = size * torch.diag_embed(torch.tensor([[2.0, 1, -1], [3, 2, 1]], dtype=dtype))
+    expected = size * torch.tensor([[2.0, 1, -1], [3, 2, 1]], dtype=dtype)
+    torch.testing.assert_close(dp.singular_values(J), expected, rtol=1e-6, atol=0)
 
 
 def test_singular_values_of_volumes():
@@ -520,6 +552,30 @@ def test_flipped_volumes(name):
     (towards_positive,) = torch.autograd.grad(dp.determinant(J).sum(), J)
     assert value.isfinite().all()
     assert ((slope * towards_positive).sum((1, 2)) < 0).all()
+
+
+def test_volumes_that_are_not_finite_spoil_no_others():
+    """One NaN anywhere leaves no singular value of its cell, and those of the others alone."""
+    J = volume_jacobians(random_values(9, flips=True))
+    expected = dp.singular_values(J)
+    for bad in range(9):
+        spoiled = J.clone()
+        spoiled[bad].view(-1)[bad] = torch.nan
+        values = dp.singular_values(spoiled)
+        assert values[bad].isnan().all()
+        values[bad] = expected[bad]
+        assert torch.equal(values, expected)
+
+
+def test_singular_values_of_tiny_volumes():
+    """Whose determinant is too small for float64."""
+    J = 1e-200 * volume_jacobians(random_values(5, flips=False))
+    assert_near(dp.singular_values(J), torch.linalg.svdvals(J), 1e-14)
+
+
+def test_singular_values_of_volumes_are_not_of_half_precision():
+    with pytest.raises(TypeError, match=r"singular_values: J must be float32 or float64, got"):
+        dp.singular_values(torch.eye(3).half())
 
 
 def test_lscm_is_for_surfaces(unchecked):

@@ -81,6 +81,7 @@ def test_duplicate_and_unsorted_entries_are_summed():
 def test_a_factor_may_go_unused():
     """Releasing cholespy's work space, where there is none, would crash the interpreter."""
     CholeskyFactor(spd())
+    assert CholeskyFactor(spd()).multiply(columns(6, 0)).shape == (6, 0)  # as good as unused
 
 
 def test_a_factor_may_be_collected_inside_a_transform():
@@ -105,6 +106,10 @@ def test_a_factor_may_be_collected_inside_a_transform():
         "rectangular": (sp.eye(3, 4), "expected a square matrix, got shape (3, 4)"),
         "nan": (sp.diags([1.0, np.nan]), "entries that are not finite"),
         "inf": (sp.diags([1.0, np.inf]), "entries that are not finite"),
+        "infinite sum": (
+            sp.csr_matrix((np.r_[1e308, 1e308, 1], np.r_[0, 0, 1], np.r_[0, 2, 3])),
+            "entries that are not finite",
+        ),
         "negative": (-sp.eye(3), "not positive definite"),
         "indefinite": (sp.csr_matrix([[1.0, 2.0], [2.0, 1.0]]), "not positive definite"),
         "zero": (sp.csr_matrix((2, 2)), "not positive definite"),
@@ -222,7 +227,8 @@ def test_work_space_is_released():
     def resident() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
-    A, b = sp.eye(20_000, format="csr"), torch.ones(20_000, 64, dtype=torch.float64)
+    # One column, the width of the smallest work space.
+    A, b = sp.eye(50_000, format="csr"), torch.ones(50_000, 1, dtype=torch.float64)
 
     def use(times: int) -> int:
         for _ in range(times):

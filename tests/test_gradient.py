@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import gc
 import re
+import warnings
 
 import igl
 import numpy as np
 import pytest
+import scipy.sparse as sp
 import torch
 from hypothesis import given
 
 import diffpoisson as dp
-from diffpoisson.gradient import _operators, gradient_operator
+from diffpoisson.gradient import CellGeometry, SparseMatrix, _operators, gradient_operator
 from tests import checks, meshes, references
 from tests.checks import LOCAL, SOLVE, assert_near, field
 from tests.meshes import SPATIAL, TOPOLOGIES
@@ -223,3 +225,48 @@ def test_a_union_of_solvers_has_the_operators_of_the_same_mesh_assembled_alone(m
     y = torch.randn(2 * union.n_faces, 2, dtype=torch.float64)
     torch.testing.assert_close(ours.gradient(x), alone.gradient(x), rtol=1e-13, atol=1e-13)
     torch.testing.assert_close(ours.adjoint(y), alone.adjoint(y), rtol=1e-13, atol=1e-13)
+
+
+def test_torch_does_not_announce_its_csr_layout_to_users():
+    before = torch.is_warn_always_enabled()
+    torch.set_warn_always(True)  # instead of once per process
+    try:
+        with warnings.catch_warnings(action="error"):
+            SparseMatrix(sp.eye(2, format="csr"), torch.device("cpu")).multiply(torch.ones(2, 1))
+    finally:
+        torch.set_warn_always(before)
+
+
+def test_matrices_have_no_half_precision():
+    matrix = SparseMatrix(sp.eye(2, format="csr"), torch.device("cpu"))
+    with pytest.raises(TypeError, match=r"work in float32 and float64, got torch\.float16"):
+        matrix.multiply(torch.ones(2, 1).half())
+
+
+@shapes
+def test_operations_at_given_positions_are_those_of_a_mesh_there(name):
+    vertices, faces = TOPOLOGIES[name](1)
+    mesh, moved = dp.Mesh(vertices, faces), dp.Mesh(1.5 * vertices + np.sin(vertices), faces)
+    v, there = moved.vertices, CellGeometry.at(mesh, moved.vertices)
+    assert_near(there.vertex_measures(), moved._double_vertex_measures, LOCAL)
+    phi = torch.from_numpy(checks.normal((2, 3, len(vertices), 2)))
+    assert_near(dp.jacobians(mesh, phi, vertices=v), dp.jacobians(moved, phi), LOCAL)
+    R = field(mesh, c=2, k=mesh.cell_dim, batch=(2, 3))
+    assert_near(dp.divergence(mesh, R, vertices=v), dp.divergence(moved, R), LOCAL)
+    single = dp.divergence(mesh, R.float(), vertices=v)
+    assert torch.equal(single, dp.divergence(mesh, R.float().double(), vertices=v).float())
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("positions", "error", "message"),
+    [
+        (lambda v: v.numpy(), TypeError, "jacobians: vertices must be a torch tensor, got ndarray"),
+        (lambda v: v.half(), TypeError, "jacobians: vertices must be float32 or float64, got"),
+        (lambda v: 0 * v, dp.MeshError, "jacobians: at the given vertices, "),
+    ],
+)
+def test_positions_that_are_none_are_refused(positions, error, message):
+    mesh = dp.Mesh(*meshes.disk())
+    with pytest.raises(error, match="^" + re.escape(message)):
+        dp.jacobians(mesh, mesh.vertices, vertices=positions(mesh.vertices))

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.mesh import require_cells
+from diffpoisson.mesh import describe_indices, require_cells
 from tests import meshes, references
 from tests.meshes import SPATIAL, TOPOLOGIES
 
@@ -68,7 +68,7 @@ REJECTED = {
     "inf": (placed(V, ([0, 3], 1), np.inf), F, "2 vertices [0, 3] with a coordinate that is not"),
     "unreferenced": (np.r_[V, V + 2], F, "4 vertices [4, 5, 6, 7] that no face uses"),
     "many culprits": (np.r_[V, V, V], F, "8 vertices [4, 5, 6, 7, 8, …] that no face uses"),
-    "zero area": (placed(V, 3, [0.3, 0, 0]), F, "1 face [1] of zero area"),
+    "zero area": (placed(V, 3, [0.3, 0, 0]), F, "1 face [1] of zero area; Mesh.cleaned"),
     "coincident vertices": (placed(V, 3, V[0]), F, "2 faces [1, 3] of zero area"),
     "zero area up to rounding": (
         np.array([[0.1, 0.3, 0], [0.1 + 0.2, 0.9, 0], [0.1 + 0.7, 2.4, 0]]),
@@ -582,6 +582,36 @@ def test_moved_positions_without_area_are_refused():
             dp.MeshError,
             "Mesh: vertices require grad",
         ),
+        (
+            lambda m: torch.vmap(lambda v: dp.Mesh.cleaned(v, F))(torch.from_numpy(V)[None]),
+            dp.MeshError,
+            "Mesh: vertices require grad, but a mesh is constant",
+        ),
+        (
+            lambda m: m.split_vertices(V),
+            TypeError,
+            "Mesh.split_vertices: values must be a dense torch tensor, got ndarray",
+        ),
+        (
+            lambda m: m.split_faces(torch.ones(4).to_sparse()),
+            TypeError,
+            "Mesh.split_faces: values must be a dense torch tensor",
+        ),
+        (
+            lambda m: m.split_faces(torch.ones(4), dim=0.0),
+            TypeError,
+            "Mesh.split_faces: dim must be an integer, got float",
+        ),
+        (
+            lambda m: m.split_faces(torch.ones(5)),
+            ValueError,
+            "Mesh.split_faces: expected 4 values along dim 0, got (5,)",
+        ),
+        (
+            lambda m: m.split_vertices(torch.ones(4), dim=1),
+            ValueError,
+            "Mesh.split_vertices: expected 4 values along dim 1, got (4,)",
+        ),
     ],
 )
 def test_arguments_of_other_kinds(call, error, message):
@@ -592,3 +622,36 @@ def test_arguments_of_other_kinds(call, error, message):
 @pytest.mark.parametrize("dtype", [np.int32, np.uint8])
 def test_narrow_indices(dtype):
     assert dp.Mesh(V, F.astype(dtype)).faces.dtype == torch.int64
+
+
+@pytest.mark.parametrize(
+    ("legs", "dtype", "beyond"),
+    [
+        ((2.0**-255, 2.0**-255), np.float64, 1 / 2),  # the square of the area is least
+        ((2.0**-62, 2.0**-63), np.float32, 1 / 2),
+        (((2 - 2.0**-23) * 2.0**64, 2.0**64), np.float32, 2),
+    ],
+)
+def test_areas_up_to_the_end_of_the_range(legs, dtype, beyond):
+    """The least and the largest normal number are areas still."""
+    a, b = legs
+    face = np.array([[0, 1, 2]])
+    dp.Mesh(np.array([[0, 0], [a, 0], [0, b]], dtype=dtype), face)
+    with pytest.raises(dp.MeshError, match=f"areas leave the range of torch.{dtype.__name__}"):
+        dp.Mesh(np.array([[0, 0], [a, 0], [0, b * beyond]], dtype=dtype), face)
+
+
+def test_five_culprits_are_all_there_are():
+    assert describe_indices(np.arange(5), "face", "faces") == "5 faces [0, 1, 2, 3, 4]"
+    assert describe_indices(np.arange(6), "face", "faces") == "6 faces [0, 1, 2, 3, 4, …]"
+
+
+def test_geometry_is_in_double_precision_whatever_the_mesh_s():
+    """The two products in this determinant, 2⁻²⁶, are one number in float32."""
+    e = 2.0**-13
+    vertices = torch.tensor([[0, 0], [1 + e, 1], [-1, e - 1]], dtype=torch.float32)
+    face = torch.tensor([[0, 1, 2]])
+    mesh = dp.Mesh(vertices, face)
+    assert mesh.measures.item() == e**2 / 2
+    assert dp.Mesh.cleaned(vertices, face).mesh.measures.item() == e**2 / 2
+    require_cells("f", vertices, face)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from diffpoisson.packing import pack
+from diffpoisson.packing import _on_shelves, pack
 from tests import meshes
 
 
@@ -57,6 +57,20 @@ def test_the_square_around_them_is_mostly_full(count):
     boxes = sum(np.ptp(p, axis=0).prod() for p in packed)
     side = max(p.max() for p in packed)
     assert boxes > 0.5 * side**2
+
+
+def test_the_tightest_of_the_shelf_widths_is_taken():
+    """Two boxes of 4 × 2 on each other and a small one beside or above them."""
+    sizes = np.array([[4.0, 2], [2, 1], [4, 2]])
+    assert (_on_shelves(sizes) + sizes).max() == 5
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1, 1e6])
+def test_the_gap_is_in_proportion(scale):
+    square = scale * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    first, second = pack([square, square])
+    gap = (second.min(axis=0) - first.max(axis=0)).max()
+    assert gap == pytest.approx(0.01 * np.sqrt(2) * scale)
 
 
 def test_slivers():

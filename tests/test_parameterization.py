@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.parameterization import procrustes, slim, tutte
+from diffpoisson.parameterization import _Descent, procrustes, slim, tutte
 from tests import meshes, references
 
 
@@ -192,6 +192,43 @@ def test_slim_cannot_make_an_overlapping_map_injective() -> None:
         slim(mesh, winding, injective=True)
 
 
+@pytest.mark.parametrize(
+    ("energies", "tolerance", "patience", "followed", "converged"),
+    [
+        ([10, 8, 7.5, 1], 0.1, 1, 3, True),
+        ([10, 8, 7.9, 7.8, 7.75, 1], 0.1, 3, 5, True),
+        ([10, 10, 1], 0.0, 1, 2, True),
+        ([10, 8], 0.1, 1, 2, False),
+        ([10, 8, 9, 1], 0.1, 1, 2, True),
+        ([10, 9.05, 9, 1], 0.1, 1, 3, True),
+        ([10, 8, math.inf, 1], 0.1, 1, 2, False),
+        ([10, 8, math.nan, 1], 0.1, 1, 2, False),
+    ],
+)
+def test_descent_follows_energies_while_they_fall(
+    energies, tolerance, patience, followed, converged
+) -> None:
+    """A map of one vertex at (its energy, its number)."""
+    first, *iterates = (np.array([[energy, float(k)]]) for k, energy in enumerate(energies))
+    descent = _Descent(lambda x: float(x[0, 0]), lambda x: True, tolerance, first)
+    assert descent.follow(iter(iterates), 100, patience) is converged
+    assert descent.energies == energies[:followed]
+    assert descent.points[0, 1] == followed - 1
+
+
+def test_descent_has_no_patience_unless_told_so_and_keeps_what_is_admitted() -> None:
+    first, *iterates = (
+        np.array([[energy, float(k)]]) for k, energy in enumerate([10.0, 8, 5, 4.9, 1])
+    )
+    descent = _Descent(lambda x: float(x[0, 0]), lambda x: bool(x[0, 0] > 6), 0.1, first)
+    remaining = iter(iterates)
+    assert descent.follow(remaining, 100)
+    assert len(list(remaining)) == 1
+    assert not descent.admitted
+    assert descent.energies == [10, 8]
+    assert descent.points[0, 1] == 1
+
+
 # ------------------------------------------------------- Procrustes
 
 
@@ -231,3 +268,79 @@ def test_procrustes_aligns_each_of_a_batch() -> None:
     batched = procrustes(source, target, weights)
     for k in range(4):
         torch.testing.assert_close(batched[k], procrustes(source[k], target[k], weights))
+
+
+# ------------------------------------------------------- arguments
+
+DISK = dp.Mesh(*meshes.disk(0, 4))
+FLAT = tutte(DISK)
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "message"),
+    [
+        ({"tolerance": "a"}, TypeError, "tolerance must be a number"),
+        ({"tolerance": -1.0}, ValueError, "tolerance must be finite and not negative"),
+        ({"max_iterations": 1.5}, TypeError, "max_iterations must be an integer"),
+        ({"max_iterations": -1}, ValueError, "max_iterations must be at least 0"),
+        ({"init": FLAT.numpy()}, TypeError, "init must be a torch tensor"),
+        ({"init": FLAT.half()}, TypeError, "init must be float32 or float64"),
+        ({"init": FLAT[1:]}, ValueError, r"expected init of shape \(n=16, 2\), got \(15, 2\)"),
+        ({"init": FLAT.clone().requires_grad_()}, ValueError, "init requires grad"),
+    ],
+)
+def test_slim_names_what_it_refuses(options, kind, message, unchecked) -> None:
+    with pytest.raises(kind, match="^slim: " + message):
+        slim(DISK, **{"init": FLAT} | options)
+
+
+def test_slim_without_iterations_returns_its_start() -> None:
+    result = slim(DISK, FLAT, max_iterations=0)
+    torch.testing.assert_close(result.uv, FLAT, rtol=0, atol=0)
+    assert len(result.energies) == 1
+    assert not result.converged
+
+
+@pytest.mark.parametrize("operation", [tutte, lambda mesh: slim(mesh, mesh.vertices[:, :2])])
+def test_tetrahedra_and_pairs_of_disks_are_named(operation, unchecked) -> None:
+    for arrays, message in (
+        (meshes.box(), "flattens surfaces, got tetrahedra"),
+        (meshes.union(meshes.disk(0, 3), meshes.disk(1, 3)), "2 connected components"),
+    ):
+        with pytest.raises(dp.MeshError, match=message):
+            operation(dp.Mesh(*arrays))
+
+
+POINTS, WEIGHTS = torch.eye(4)[:, :2], torch.ones(4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        (([[1.0, 0]], POINTS, WEIGHTS), TypeError, "source must be a torch tensor"),
+        ((POINTS, POINTS.numpy(), WEIGHTS), TypeError, "target must be a torch tensor"),
+        ((POINTS, POINTS, [1.0]), TypeError, "weights must be a torch tensor"),
+        ((POINTS, POINTS.to("meta"), WEIGHTS), ValueError, "target is on meta"),
+        ((POINTS, POINTS, WEIGHTS[1:]), ValueError, "expected source and target"),
+        ((POINTS, POINTS, WEIGHTS[None]), ValueError, "expected source and target"),
+        ((POINTS, POINTS[1:], WEIGHTS), ValueError, "expected source and target"),
+        ((POINTS, POINTS, 0 * WEIGHTS), ValueError, "weights must be finite and not negative"),
+        ((POINTS, POINTS, WEIGHTS / 0), ValueError, "weights must be finite and not negative"),
+        (
+            (POINTS, POINTS, torch.tensor([1.0, 1, 1, -1])),
+            ValueError,
+            "weights must be finite and not negative",
+        ),
+    ],
+)
+def test_procrustes_names_what_it_refuses(arguments, kind, message, unchecked) -> None:
+    with pytest.raises(kind, match="^procrustes: " + message):
+        procrustes(*arguments)
+
+
+def test_procrustes_ignores_points_of_no_weight() -> None:
+    rng = np.random.default_rng(0)
+    source, target = (torch.from_numpy(rng.standard_normal((6, 2))) for _ in range(2))
+    weights = torch.from_numpy(np.r_[0.15, 0.05, 0.25, 0.1, 0, 0])
+    expected = procrustes(source[:4], target[:4], weights[:4], reflect=True)
+    torch.testing.assert_close(procrustes(source, target, weights, reflect=True)[:4], expected)

@@ -13,6 +13,7 @@ from hypothesis import given
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
 import diffpoisson as dp
+from diffpoisson import poisson
 from tests import checks, meshes, references
 from tests.checks import LOCAL, SOLVE, assert_near, field, small_layer
 
@@ -283,3 +284,22 @@ def test_an_update_keeps_the_gauge_that_fixes_a_vertex():
     expected = dp.PoissonSolver(mesh.with_vertices(moved), gauge="vertex")(R)
     assert torch.equal(phi, expected)
     assert (phi[0] == 0).all()
+
+
+def test_a_factor_without_digits_raises(monkeypatch):
+    """The check alone, on a factor of another matrix: half of the size is the bound of errors."""
+    mesh = dp.Mesh(*meshes.disk(0))
+    factorised = poisson.CholeskyFactor
+
+    def solver(factor: float, **options) -> dp.PoissonSolver:
+        monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(factor * L))
+        return dp.PoissonSolver(mesh, **options)
+
+    for factor, options in (
+        (2.01, {}),
+        (2.5, {"pins": torch.tensor([0, 5])}),
+        (2.5, {"handles": torch.tensor([3])}),
+    ):
+        with pytest.raises(dp.MeshError, match="leaves no digit"):
+            solver(factor, **options)
+    solver(1.99)

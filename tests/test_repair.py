@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffpoisson as dp
-from diffpoisson.repair import clamp_flips, clamp_singular_values, untangle
-from tests import meshes
+from diffpoisson.repair import _energy, _epsilon, clamp_flips, clamp_singular_values, untangle
+from tests import meshes, references
 from tests.checks import assert_near
 
 
@@ -94,10 +94,16 @@ def test_valid_maps_come_back_as_they_are():
 
 
 def test_repairs_give_up_after_their_rounds():
-    mesh, solver, uv = spoiled(0, 1.2)
-    mirrored = uv * torch.tensor([1, -1])
-    assert clamp_flips(solver, mirrored, max_rounds=0) == (pytest.approx(mirrored), 0)
-    assert untangle(mesh, mirrored, max_rounds=1, iterations=1)[1] == 1
+    mesh, solver, uv = spoiled(0, 8.0)
+    once = solver(clamp_singular_values(dp.jacobians(mesh, uv), 0.5, 2.0))
+    assert dp.flipped(dp.jacobians(mesh, once)).any()
+    for count, expected in ((0, uv), (1, once)):
+        clamped, rounds = clamp_flips(solver, uv, limits=(0.5, 2.0), max_rounds=count)
+        assert_near(clamped, expected, 1e-12)
+        assert rounds == count
+        untangled, rounds = untangle(mesh, uv, max_rounds=count, iterations=1)
+        assert torch.equal(untangled, uv) == (count == 0)
+        assert rounds == count
 
 
 def test_untangling_turns_a_mirrored_map_over():
@@ -111,3 +117,100 @@ def test_dtype_is_kept():
     mesh, solver, uv = spoiled(1, 1.2)
     assert clamp_flips(solver, uv.float())[0].dtype == torch.float32
     assert untangle(mesh, uv.float())[0].dtype == torch.float32
+
+
+# ------------------------------------------------------- untangling
+
+
+def test_depth_of_flips_decides_epsilon():
+    """Small against the deepest flip, and falling with it to a floor near zero."""
+    depths = [0.0, 1e-4, 1e-2, 1.0, 100.0]
+    epsilons = [_epsilon(-depth) for depth in depths]
+    assert epsilons == sorted(set(epsilons))
+    assert 0 < epsilons[0] <= 1e-5
+    assert all(e < depth / 5 for e, depth in zip(epsilons[1:], depths[1:], strict=True))
+
+
+def test_energy_weighs_faces_by_area():
+    """Without regularisation the mean of ‖J‖² / det J + det J + 1 / det J."""
+    vertices, faces = meshes.disk(0)
+    J = references.jacobians(vertices, faces, vertices[:, :2])
+    u, v = np.linalg.svd(J, compute_uv=False).T
+    density = u / v + v / u + u * v + 1 / (u * v)
+    expected = np.average(density, weights=references.areas(vertices, faces))
+    mesh = dp.Mesh(vertices, faces)
+    assert float(_energy(mesh, mesh.vertices[:, :2], 0.0)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("scale", [2.0**-40, 2.0**40])
+def test_untangling_does_not_depend_on_the_unit(scale):
+    mesh, _, uv = spoiled(2, 1.2)
+    expected, rounds = untangle(mesh, uv)
+    scaled = untangle(dp.Mesh(scale * mesh.vertices, mesh.faces), scale * uv)
+    assert torch.equal(scaled[0], scale * expected)
+    assert scaled[1] == rounds
+
+
+def test_untangling_needs_neither_double_precision_nor_a_constant():
+    """Single precision is rounded at the end alone; the result has no graph."""
+    mesh, _, uv = spoiled(2, 1.2)
+    expected, rounds = untangle(mesh, uv.float().double())
+    for single in (uv.float(), uv.float().requires_grad_()):
+        actual = untangle(mesh, single)
+        assert torch.equal(actual[0], expected.float())
+        assert actual[1] == rounds
+        assert not actual[0].requires_grad
+
+
+def test_descent_stops_where_nothing_flips():
+    mesh, _, uv = spoiled(2, 1.2)
+    short, long = (untangle(mesh, uv, iterations=count) for count in (60, 200))
+    assert short[1] == 1
+    assert torch.equal(short[0], long[0])
+
+
+def test_a_face_that_is_flat_is_a_flip():
+    vertices = np.array([[0.0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 0]])
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    mesh = dp.Mesh(vertices, faces)
+    uv = mesh.vertices[:, :2].clone()
+    uv[4, 1] = 0  # on the edge from 0 to 1
+    for repaired, rounds in (clamp_flips(dp.PoissonSolver(mesh), uv), untangle(mesh, uv)):
+        assert rounds == 1
+        assert not dp.flipped(dp.jacobians(mesh, repaired)).any()
+
+
+# ------------------------------------------------------- arguments
+
+
+def test_repair_names_what_it_refuses(unchecked):
+    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
+    solver, uv = dp.PoissonSolver(mesh), mesh.vertices
+    for operation, first in ((clamp_flips, solver), (untangle, mesh)):
+        name = f"^{operation.__name__}: "
+        with pytest.raises(TypeError, match=name):
+            operation("mesh", uv)
+        with pytest.raises(TypeError, match=name + "uv must be a torch tensor"):
+            operation(first, uv.numpy())
+        with pytest.raises(TypeError, match=name + "uv must be float32 or float64"):
+            operation(first, uv.half())
+        with pytest.raises(ValueError, match=name + "expected uv of shape"):
+            operation(first, uv[1:])
+        with pytest.raises(ValueError, match=name + "max_rounds must be at least 0"):
+            operation(first, uv, max_rounds=-1)
+    with pytest.raises(ValueError, match=r"^untangle: iterations must be at least 1"):
+        untangle(mesh, uv, iterations=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ((np.eye(2), 1, 2), TypeError, "J must be a torch tensor"),
+        ((torch.eye(2).half(), 1, 2), TypeError, "J must be float32 or float64"),
+        ((torch.eye(3), 1, 2), ValueError, "expected J of shape"),
+        ((torch.eye(2), None, 2), TypeError, "smallest must be a number"),
+    ],
+)
+def test_clamping_names_what_it_refuses(arguments, kind, message, unchecked):
+    with pytest.raises(kind, match="^clamp_singular_values: " + message):
+        clamp_singular_values(*arguments)

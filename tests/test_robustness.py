@@ -8,14 +8,11 @@ import platform
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from diffpoisson import poisson
-from diffpoisson.certificate import is_simple, orientations
 from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import gradient_operator
 from diffpoisson.linear_map import LinearMap
@@ -254,70 +251,8 @@ def test_too_thin_faces_raise_and_are_named(shape, aspect):
         dp.PoissonSolver(mesh)
 
 
-def test_a_factor_without_digits_raises(monkeypatch):
-    """The check alone, on a factor of another matrix; with pins and handles too."""
-    mesh = dp.Mesh(*meshes.disk(0))
-    factorised = poisson.CholeskyFactor
-    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(2.5 * L, device))
-    for options in ({}, {"pins": torch.tensor([0, 5])}, {"handles": torch.tensor([3])}):
-        with pytest.raises(dp.MeshError, match="leaves no digit"):
-            dp.PoissonSolver(mesh, **options)
-    monkeypatch.setattr(poisson, "CholeskyFactor", lambda L, device: factorised(1.5 * L, device))
-    dp.PoissonSolver(mesh)  # wrong by a third: a digit is left
-
-
 def _thinnest(mesh: dp.Mesh) -> int:
     """The face with the least height over its longest edge."""
     corners = mesh.vertices[mesh.faces]
     longest = (corners - corners.roll(1, dims=1)).norm(dim=-1).max(dim=1).values
     return int((mesh.areas / longest**2).argmin())
-
-
-# ------------------------------------------------------- maps of extreme size
-
-
-@pytest.mark.parametrize("scale", [1e-170, 1, 1e170])
-def test_certificates_at_any_scale(scale):
-    """Where products of coordinates underflow or overflow, signs are exact all the same."""
-    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
-    uv = mesh.vertices * scale
-    assert orientations(uv[mesh.faces].numpy()).tolist() == [1] * mesh.n_faces
-    assert orientations(uv[mesh.faces].flip(1).numpy()).tolist() == [-1] * mesh.n_faces
-    square = np.array([[0, 0], [1, 0], [2, 0], [2, 2], [0, 2.0]]) * scale
-    assert is_simple(square)
-    square[2] = scale * np.array([0.5, 0])  # folds back onto the edge before it
-    assert not is_simple(square)
-
-
-def test_maps_that_are_not_finite_get_no_certificate():
-    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
-    uv = mesh.vertices.clone()
-    uv[3, 1] = torch.nan
-    with pytest.raises(ValueError, match=r"^certify: uv has entries that are not finite"):
-        dp.certify(mesh, uv)
-    assert (orientations(uv[mesh.faces].numpy()) == 0).tolist() == (mesh.faces == 3).any(1).tolist()
-
-
-def test_certificates_need_no_graph():
-    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
-    assert dp.certify(mesh, mesh.vertices.clone().requires_grad_()).injective
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_repair_names_what_it_refuses():
-    mesh = dp.Mesh(*meshes.planar_disk(0, 4))
-    solver, uv = dp.PoissonSolver(mesh), mesh.vertices
-    for operation, first in ((dp.clamp_flips, solver), (dp.untangle, mesh)):
-        name = f"^{operation.__name__}: "
-        with pytest.raises(TypeError, match=name):
-            operation("mesh", uv)
-        with pytest.raises(TypeError, match=name + "uv must be a torch tensor"):
-            operation(first, uv.numpy())
-        with pytest.raises(ValueError, match=name + "expected uv of shape"):
-            operation(first, uv[1:])
-        with pytest.raises(ValueError, match=name + "max_rounds must be at least 0"):
-            operation(first, uv, max_rounds=-1)
-    with pytest.raises(ValueError, match=r"^clamp_singular_values: expected J of shape"):
-        dp.clamp_singular_values(torch.eye(3), 1, 2)
-    with pytest.raises(TypeError, match=r"^clamp_singular_values: smallest must be a number"):
-        dp.clamp_singular_values(torch.eye(2), None, 2)

@@ -111,6 +111,14 @@ def test_single_precision_mesh():
     assert_near(samples.barycentric.sum(1), np.ones(1000, np.float32), 1e-6)
 
 
+def test_the_largest_random_number_is_on_the_last_face(monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "uniform_", lambda x, **_: x.fill_(1 - 2.0**-53))
+    vertices, faces = meshes.disk()
+    for scale in np.geomspace(1e-3, 1e3, 50):
+        mesh = dp.Mesh(scale * vertices, faces)
+        assert dp.sample_surface(mesh, 1).faces.item() == mesh.n_faces - 1
+
+
 def test_no_samples_and_wrong_input(unchecked):
     mesh = dp.Mesh(*meshes.disk())
     none = dp.sample_surface(mesh, 0)
@@ -121,3 +129,7 @@ def test_no_samples_and_wrong_input(unchecked):
     message = "interpolate: expected values of shape (…, n=25, c), got (24, 3)"
     with pytest.raises(ValueError, match=re.escape(message)):
         none.interpolate(mesh, torch.zeros(24, 3, dtype=torch.float64))
+    with pytest.raises(TypeError, match=r"^interpolate: expected a diffpoisson\.Mesh"):
+        none.interpolate(None, mesh.vertices)
+    with pytest.raises(TypeError, match=r"^interpolate: values must be a torch tensor"):
+        none.interpolate(mesh, mesh.vertices.numpy())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import igl
 import numpy as np
 import pytest
@@ -10,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffpoisson as dp
+from diffpoisson import seams
 from diffpoisson.seams import CutMesh, _sums_to_the_root, cut_to_disks
-from tests import meshes
+from tests import meshes, references
 
 
 def assert_cut_to_disks(mesh: dp.Mesh, cut: CutMesh) -> None:
@@ -116,6 +119,102 @@ def test_extended_seams_beat_those_of_topology():
     assert extended.n_vertices < 1.2 * mesh.n_vertices
 
 
+def disk_piece(size: int) -> seams._Piece:
+    mesh = dp.Mesh(*meshes.disk(0, size))
+    return seams._Piece(mesh, np.arange(mesh.n_vertices))
+
+
+@pytest.mark.parametrize(
+    ("size", "fall", "max_cuts", "cuts"),
+    [
+        (6, 1.0, 30, 0),  # three cuts in vain are taken back
+        (6, 0.95, 5, 5),  # a tenth in three cuts
+        (6, 0.5, 2, 2),
+        (6, 0.5, 0, 0),
+        (3, 0.5, 30, 1),  # no more, since no vertex is inside
+        (6, 0.0, 30, 1),  # good enough
+    ],
+)
+def test_cuts_go_on_while_energies_fall(monkeypatch, size, fall, max_cuts, cuts):
+    """Energies that are made up: each is that fraction of the one before."""
+    energies = (fall**k for k in itertools.count())
+    monkeypatch.setattr(seams, "arap", lambda J: torch.full_like(J[:, 0, 0], next(energies)))
+    monkeypatch.setattr(seams, "_GOOD_ENOUGH", 0.0)
+    piece = disk_piece(size)
+    pieces = [piece]
+    cut = seams._Piece.cut
+
+    def noted(piece: seams._Piece, edges: np.ndarray) -> tuple[seams._Piece, np.ndarray]:
+        result = cut(piece, edges)
+        pieces.append(result[0])
+        return result
+
+    monkeypatch.setattr(seams._Piece, "cut", noted)
+    extended = seams._extended(piece, max_cuts)
+    assert extended is pieces[cuts]
+
+
+def test_local_global_steps_end_at_an_isometry():
+    flat, faces = meshes.planar_disk(0, 5)
+    mesh = dp.Mesh(np.c_[flat, np.zeros(len(flat))], faces)
+    for scale in (0.7, 1.5):
+        uv = seams._local_global(mesh, scale * mesh.vertices[:, :2])
+        values = dp.singular_values(dp.jacobians(mesh, uv))
+        np.testing.assert_allclose(values, np.ones((mesh.n_faces, 2)), atol=1e-9)
+
+
+def shortest_paths(vertices: np.ndarray, faces: np.ndarray, sources: list[int]) -> dict:
+    """Length and vertices of the shortest path of edges from each vertex to a source, relaxed."""
+    edges = {(f[i], f[j]) for f in faces.tolist() for i in range(3) for j in range(3) if i != j}
+    paths = {source: (0.0, [source]) for source in sources}
+    while True:
+        longer = {
+            b: (d + np.linalg.norm(vertices[a] - vertices[b]), [b, *path])
+            for a, b in edges
+            if a in paths
+            for d, path in [paths[a]]
+            if d + np.linalg.norm(vertices[a] - vertices[b]) < paths.get(b, (np.inf,))[0] - 1e-12
+        }
+        if not longer:
+            return paths
+        paths |= longer
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_path_to_the_seam_is_the_most_promising(seed):
+    rng = np.random.default_rng(seed)
+    vertices, faces, *_ = meshes.renumbered(rng, *meshes.disk(seed, 6))
+    vertices = vertices * [3, 1, 1]
+    mesh = dp.Mesh(vertices, faces)
+    density = rng.uniform(0.1, 10, len(faces))
+    areas = references.areas(vertices, faces)
+    around = [
+        np.average(density[f], weights=areas[f]) for f in ((faces == v).any(1) for v in range(36))
+    ]
+    promises = {}
+    for end, (length, path) in shortest_paths(
+        vertices, faces, mesh.boundary_loops[0].tolist()
+    ).items():
+        steps = [np.linalg.norm(vertices[a] - vertices[b]) for a, b in itertools.pairwise(path)]
+        promises[end] = length * np.dot([around[v] for v in path[:-1]], steps), path
+    expected = max(promises.values())[1]
+    assert seams._path_to_seam(mesh, torch.from_numpy(density)).tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["sphere", "smallest"])
+def test_path_across_is_a_shortest_one_of_two_edges_or_more(name):
+    smallest = (
+        np.r_[np.zeros((1, 3)), np.eye(3)],
+        np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+    )
+    vertices, faces = smallest if name == "smallest" else meshes.sphere(0, 2)
+    path = seams._path_across(dp.Mesh(vertices, faces)).tolist()
+    if name == "smallest":
+        assert len(set(path)) == len(path) == 3
+    else:
+        assert path == shortest_paths(vertices, faces, [path[-1]])[path[0]][1]
+
+
 @given(seed=meshes.seeds, n=st.integers(1, 40))
 def test_sums_to_the_root(seed, n):
     rng = np.random.default_rng(seed)
@@ -137,6 +236,7 @@ def test_dtype_is_kept_and_scale_does_not_matter():
     mesh = dp.Mesh(vertices.astype(np.float32), faces)
     surface, vertex_map = cut_to_disks(mesh)
     assert surface.dtype == torch.float32
+    assert torch.equal(cut_to_disks(mesh.to(torch.float64)).vertex_map, vertex_map)
     for scale in (2.0**-20, 2.0**20):
         scaled = cut_to_disks(dp.Mesh(mesh.vertices * scale, faces))
         assert torch.equal(scaled.vertex_map, vertex_map)

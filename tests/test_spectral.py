@@ -101,6 +101,26 @@ def test_all_eigenpairs_of_small_meshes(name):
     np.testing.assert_allclose(vectors.T @ (M[:, None] * vectors), np.eye(n), rtol=0, atol=1e-10)
 
 
+def test_fewer_eigenpairs_are_the_first_ones():
+    """Of every number: none but constants, by Lanczos, by the dense route."""
+    mesh = dp.Mesh(*meshes.union(meshes.disk(0, 3), meshes.disk(1, 4)))
+    expected, _ = dp.laplacian_eigenpairs(mesh, mesh.n_vertices)
+    for k in range(1, mesh.n_vertices):
+        values, vectors = dp.laplacian_eigenpairs(mesh, k)
+        assert vectors.shape == (mesh.n_vertices, k)
+        assert_near(values, expected[:k], SOLVE)
+
+
+def test_spectrum_of_a_ribbon():
+    """Long for its area, so that its first eigenvalues are small."""
+    vertices, faces = meshes.planar_disk(size=6)
+    vertices = vertices * [40, 1]
+    values, _ = dp.laplacian_eigenpairs(dp.Mesh(vertices, faces), 36)
+    expected = reference(vertices, faces)[0]
+    assert expected[1] * 40 < 1  # area 40
+    np.testing.assert_allclose(values[1:], expected[1:], rtol=SOLVE)
+
+
 def test_fewer_eigenpairs_than_components():
     mesh = dp.Mesh(*meshes.parts())
     values, vectors = dp.laplacian_eigenpairs(mesh, 2)
@@ -212,11 +232,25 @@ def test_wave_kernel_signature_against_its_formula(name, mass):
     assert_near(dimensionless, expected * M.sum(), 1e-7)
 
 
+@masses
+def test_single_precision_is_left_at_the_end(mass):
+    """Masses and signatures are those of float64, rounded once."""
+    vertices, faces = large("disk")
+    mesh = dp.Mesh(vertices.astype(np.float32), faces)
+    double = mesh.to(torch.float64)
+    assert torch.equal(dp.lumped_mass(mesh, mass), dp.lumped_mass(double, mass).float())
+    values, vectors = (x.double().numpy() for x in dp.laplacian_eigenpairs(mesh, 20, mass=mass))
+    expected = double.areas.sum().item() * reference_wks(values[1:], vectors[:, 1:], 30)
+    actual = dp.wave_kernel_signature(mesh, 30, n_eigenpairs=20, mass=mass)
+    assert actual.dtype == torch.float32
+    assert np.abs(actual.double().numpy() / expected - 1).max() <= 1.001 * 2**-24
+
+
 def test_wave_kernel_signature_defaults():
     """The paper's 50 energies from 50 eigenpairs; the area-weighted mean over the mesh is one."""
     mesh = dp.Mesh(*large("sphere"))
     signature = dp.wave_kernel_signature(mesh)
-    assert signature.shape == (mesh.n_vertices, 50)
+    assert torch.equal(signature, dp.wave_kernel_signature(mesh, 50, n_eigenpairs=50))
     means = mesh.vertex_areas @ signature / mesh.areas.sum()
     np.testing.assert_allclose(means, np.ones(50), rtol=1e-9)
 
@@ -252,6 +286,13 @@ def test_heat_kernel_signature_against_its_formula(name):
     assert_near(actual, expected, 1e-7)
 
 
+def test_heat_at_time_zero():
+    mesh = dp.Mesh(*large("disk"))
+    now = dp.heat_kernel_signature(mesh, torch.zeros(1).double(), n_eigenpairs=LANCZOS)
+    _, vectors = dp.laplacian_eigenpairs(mesh, LANCZOS)
+    assert_near(now, (vectors**2).sum(dim=1, keepdim=True), 1e-12)
+
+
 def test_heat_settles_to_one_over_the_area():
     mesh = dp.Mesh(*large("parts"))
     late = dp.heat_kernel_signature(mesh, torch.tensor([1e9], dtype=torch.float64))[:, 0]
@@ -273,6 +314,14 @@ def test_too_many_or_too_few_eigenpairs_raise(k):
 def test_unknown_mass_raises(unchecked):
     with pytest.raises(ValueError, match="mass must be 'barycentric' or 'voronoi', got 'full'"):
         dp.lumped_mass(dp.Mesh(*meshes.disk()), "full")
+
+
+def test_number_of_energies(unchecked):
+    mesh = dp.Mesh(*meshes.disk())
+    assert dp.wave_kernel_signature(mesh, 1, n_eigenpairs=5).shape == (25, 1)
+    for count, kind in ((0, ValueError), (2.5, TypeError)):
+        with pytest.raises(kind, match=r"^wave_kernel_signature: n_energies must be"):
+            dp.wave_kernel_signature(mesh, count, n_eigenpairs=5)
 
 
 def test_too_small_spectrum_raises():

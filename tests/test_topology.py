@@ -52,6 +52,18 @@ def test_edges_and_boundary_by_counting(name):
     assert sorted(map(tuple, topology.boundary_half_edges(faces).tolist())) == sorted(expected)
 
 
+@pytest.mark.parametrize("n", [9, 200, 2**31])
+def test_edges_in_lexicographic_order(n):
+    """Of few vertices, which share edges, and of indices as large as the keys allow."""
+    faces = np.random.default_rng(0).integers(n, size=(300, 3))
+    faces[::2, 1] = faces[1::2, 0]  # some first vertices are shared, however large n is
+    edges, counts = topology.undirected_edges(faces)
+    every = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    expected = np.unique(every, axis=0, return_counts=True)
+    assert np.array_equal(edges, expected[0])
+    assert np.array_equal(counts, expected[1])
+
+
 @given(arbitrary_cells())
 def test_manifold_by_brute_force(drawn):
     """Edges once in each direction at most, and the faces of each vertex one fan."""
@@ -70,6 +82,14 @@ def test_manifold_by_brute_force(drawn):
                 around = [other for other in around if other not in joined]
             expected &= not around
     assert topology.is_manifold(faces, n) == expected
+
+
+def test_a_manifold_is_one_whichever_edge_comes_first():
+    """Two faces, all of whose vertices are at the boundary: each of their fans counts one edge."""
+    for i, j in np.ndindex(3, 3):
+        for faces in ([[0, 1, 2], [1, 0, 3]], [[1, 0, 3], [0, 1, 2]]):
+            turned = np.array([np.roll(faces[0], i), np.roll(faces[1], j)])
+            assert topology.is_manifold(turned, 4)
 
 
 @names

@@ -787,6 +787,11 @@ def test_a_mesh_of_moving_vertices_raises(apply):
         apply(lambda v: solver.update(v)(R).sum(), v)
 
 
+def test_properties_are_documented_on_the_class():
+    assert inspect.getdoc(dp.Mesh.measures) == inspect.getdoc(dp.Mesh.__dict__["measures"])
+    assert dp.Mesh.measures.__doc__
+
+
 def test_a_mesh_of_dual_vertices_raises():
     _, _, v = moving_solver()
     faces = surface(torch.float64, "cpu").faces

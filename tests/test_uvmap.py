@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from fractions import Fraction
 
 import numpy as np
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffpoisson as dp
+from diffpoisson import flattening
 from tests import meshes, references
 from tests.checks import assert_near
 from tests.test_repair import spoiled
@@ -84,6 +87,71 @@ def test_every_start_ends_valid_and_as_good_as_slim(kind):
     expected = {"none": "tutte", "valid": "init", "some flips": "init+clamp"}
     assert result.method.startswith(expected.get(kind, ""))
     assert set(result.milliseconds) >= {"slim", "certify"}
+
+
+def small_starts() -> tuple[dp.Mesh, torch.Tensor, torch.Tensor]:
+    """A disk of 16 vertices, its projection, and the same with one corner folded in."""
+    mesh = dp.Mesh(*meshes.disk(0, 4))
+    flat = mesh.vertices[:, :2].clone()
+    folded = flat.clone()
+    folded[3] = torch.tensor([0.25, 0.75])
+    assert exact_flips(folded[mesh.faces].numpy()) == 1
+    return mesh, flat, folded
+
+
+def test_stages_run_where_flips_are_left(monkeypatch):
+    mesh, flat, folded = small_starts()
+
+    def method(start: torch.Tensor) -> str:
+        return dp.parameterize(mesh, start, tolerance=1e-2).method
+
+    mirrored = flat * torch.tensor([1, -1])
+    assert [method(uv) for uv in (flat, folded, mirrored)] == ["init", "init+clamp", "tutte"]
+    monkeypatch.setattr(flattening, "clamp_flips", lambda solver, uv: (uv, 0))
+    assert method(folded) == "init+clamp+untangle"
+    monkeypatch.setattr(flattening, "untangle", lambda mesh, uv: (uv, 0))
+    assert method(folded) == "tutte"
+
+
+def test_times_and_iterations(monkeypatch):
+    """A clock that is two seconds ahead at each look; SLIM runs twice where Tutte takes over."""
+    clock = itertools.count(5.0, 2.0)
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    mesh, _, folded = small_starts()
+    uvmap = dp.parameterize(mesh, folded, tolerance=0.0, max_iterations=3)
+    assert uvmap.slim_iterations == 3
+    stages = dict.fromkeys(["init", "clamp", "slim", "certify", "pack"], 2000)
+    assert uvmap.milliseconds == stages
+    strip = winding_strip(1.2)
+    uvmap = dp.parameterize(strip, strip.vertices[:, :2], max_iterations=1)
+    stages = dict.fromkeys(["init", "tutte", "certify", "pack"], 2000)
+    assert uvmap.milliseconds == stages | {"slim": 4000}
+
+
+def test_one_chart_stays_where_slim_leaves_it():
+    mesh, *_ = small_starts()
+    assert torch.equal(dp.parameterize(mesh).uv, dp.slim(mesh, dp.tutte(mesh)).uv)
+
+
+def test_single_precision_is_rounded_at_the_end():
+    mesh, _, folded = small_starts()
+    start = folded.float()
+    expected = dp.parameterize(mesh, start.double()).uv
+    assert torch.equal(dp.parameterize(mesh, start.requires_grad_()).uv, expected)
+    single = dp.Mesh.concatenate([mesh, mesh]).to(torch.float32)
+    double = single.to(torch.float64)
+    assert torch.equal(dp.parameterize(single).uv, dp.parameterize(double).uv.float())
+
+
+def test_solver_is_used_for_its_own_mesh_alone(monkeypatch):
+    mesh, _, folded = small_starts()
+    two = dp.Mesh.concatenate([mesh, mesh])
+    uvmap = dp.parameterize(two, lambda chart: folded, solver=dp.PoissonSolver(two))
+    assert_valid(two, uvmap)
+    assert uvmap.method == "init+clamp"
+    solver = dp.PoissonSolver(mesh)
+    monkeypatch.setattr(flattening, "PoissonSolver", None)
+    assert dp.parameterize(mesh, folded, solver=solver).method == "init+clamp"
 
 
 def test_result_does_not_depend_on_unit():
@@ -217,13 +285,31 @@ def test_what_is_not_a_disk_is_named_with_the_remedy(name, message):
         dp.parameterize(dp.Mesh(*meshes.SPATIAL[name](0)))
 
 
-def test_what_cannot_be_mapped_raises():
+def test_components_that_are_not_disks_are_named_up_to_three():
+    vertices = np.r_[np.zeros((1, 3)), np.eye(3)]
+    closed = vertices, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    for count, more in (
+        (3, "2 of 3 has [^;]* genus 0;"),
+        (4, "2 of 4 has .* and 1 more components;"),
+    ):
+        mesh = dp.Mesh(*meshes.union(*[closed] * count))
+        with pytest.raises(dp.MeshError, match=more) as caught:
+            dp.parameterize(mesh)
+        assert str(caught.value).count(" has ") == 3
+        assert ("more" in str(caught.value)) == (count == 4)
+
+
+def test_what_cannot_be_mapped_raises(unchecked):
+    with pytest.raises(TypeError, match=r"^parameterize: expected a diffpoisson\.Mesh"):
+        dp.parameterize(None)
     for build, words in ((meshes.planar_disk, "D = 2"), (meshes.box, "tetrahedra")):
-        with pytest.raises(dp.MeshError, match=words):
+        with pytest.raises(dp.MeshError, match=f"^parameterize: maps surfaces .*{words}"):
             dp.parameterize(dp.Mesh(*build()))
     mesh = dp.Mesh(*meshes.disk())
     with pytest.raises(ValueError, match=r"expected init of shape \(n=25, 2\), got \(4, 2\)"):
         dp.parameterize(mesh, torch.zeros(4, 2))
+    with pytest.raises(TypeError, match=r"^parameterize: init must be a torch tensor"):
+        dp.parameterize(mesh, np.zeros((25, 2)))
     with pytest.raises(ValueError, match="not finite"):
         dp.parameterize(mesh, torch.full((25, 2), np.nan))
     several = dp.Mesh(*meshes.parts())

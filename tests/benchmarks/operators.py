@@ -14,7 +14,7 @@ from torch import Tensor
 import diffpoisson as dp
 from diffpoisson import cells, testing
 from diffpoisson.factor import CholeskyFactor
-from diffpoisson.gradient import gradient_operator
+from diffpoisson.gradient import gradient_operator, matrices_to_columns
 from tests.benchmarks import limits
 from tests.benchmarks.figures import Figure, Limit, cost, speed_up
 from tests.benchmarks.harness import alternate, main
@@ -41,11 +41,11 @@ class BareLayer(NamedTuple):
         return x
 
     def forward(self, columns: Tensor) -> Tensor:
-        """(m·d, k) columns of R to (n - 1, k) columns of Φ."""
+        """(d·m, k) columns of R to (n - 1, k) columns of Φ."""
         return self.solve(self.divergence @ columns)
 
     def backward(self, grad: Tensor) -> Tensor:
-        """(n - 1, k) to (m·d, k)."""
+        """(n - 1, k) to (d·m, k)."""
         return self.adjoint @ self.solve(grad)
 
 
@@ -112,7 +112,7 @@ def _poisson(
     layer, bare = dp.PoissonSolver(mesh), BareLayer.of(mesh)
     R = torch.randn(*batch, mesh.n_faces, 3, 2, dtype=torch.float64, requires_grad=True)
     upstream = torch.randn(*batch, mesh.n_vertices, 3, dtype=torch.float64)
-    columns = R.detach().movedim((-3, -1), (0, 1)).reshape(2 * mesh.n_faces, -1)
+    columns = matrices_to_columns(R.detach())
     bare_upstream = upstream.movedim(-2, 0).reshape(mesh.n_vertices, -1)[1:].contiguous()
     _require_equal(layer(R), bare.forward(columns))
 
@@ -172,7 +172,7 @@ def _gradient(mesh: dp.Mesh, turns: int) -> Iterator[Figure]:
     matrix = gradient_operator(mesh).matrix
     phi = torch.randn(mesh.n_vertices, 3)
     R = torch.randn(mesh.n_faces, 3, 2)
-    columns = R.mT.reshape(-1, 3)
+    columns = matrices_to_columns(R)
     coo, coo_T = (csr(A, torch.float32).to_sparse_coo().coalesce() for A in (matrix, matrix.T))
     hats = cells.hat_gradients(mesh._corners, mesh._double_frames).float()
     operator = gradient_operator(mesh)

@@ -73,9 +73,10 @@ def determinant(J: Jacobian) -> Density:
     shape = _shape(J)
     if shape == (3, 3):
         return (torch.linalg.cross(J[..., 0], J[..., 1]) * J[..., 2]).sum(-1)
-    u, v = J.unbind(-1)
     if shape == (2, 2):
-        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+        a, b, c, d = _entries(J)
+        return a * d - b * c
+    u, v = J.unbind(-1)
     return torch.linalg.vector_norm(torch.linalg.cross(u, v), dim=-1)
 
 
@@ -95,8 +96,8 @@ def symmetric_dirichlet(J: Jacobian, epsilon: float = 0.0) -> Density:
 
     Regularised: ‖J‖² + ‖cof J‖² / χ².
     """
-    chi = _positive_determinant(J, epsilon)
-    return _guard(_squared_norm(J) + _squared_inverse(J, chi), chi)
+    chi, norm = _positive_determinant(J, epsilon), _squared_norm(J)
+    return _guard(norm + _squared_inverse(J, chi, norm), chi)
 
 
 def arap(J: Jacobian) -> Density:
@@ -126,9 +127,10 @@ def mips(J: Jacobian, epsilon: float = 0.0) -> Density:
     Of volumes, (‖J‖²‖J⁻¹‖² - 1) / 4 (Fu et al. 2015, eq. 10, twice).
     """
     chi = _positive_determinant(J, epsilon)
+    norm = _squared_norm(J)
     if _shape(J) == (3, 3):
-        return _guard((_squared_norm(J) * _squared_inverse(J, chi) - 1) / 4, chi)
-    return _guard(_squared_norm(J) / chi, chi)
+        return _guard((norm * _squared_inverse(J, chi, norm) - 1) / 4, chi)
+    return _guard(norm / chi, chi)
 
 
 def area_distortion(J: Jacobian, epsilon: float = 0.0) -> Density:
@@ -174,14 +176,26 @@ def _shape(J: Tensor) -> tuple[int, int]:
     return shape
 
 
+def _entries(J: Tensor) -> tuple[Tensor, ...]:
+    """The entries of J row by row, each contiguous: strided, arithmetic takes twice as long."""
+    return J.flatten(-2).movedim(-1, 0).contiguous().unbind(0)
+
+
 def _squared_norm(J: Tensor) -> Tensor:
-    return J.square().sum(dim=(-2, -1))
+    first, *others = (x * x for x in _entries(J))
+    return sum(others, first)
 
 
-def _squared_inverse(J: Tensor, chi: Tensor) -> Tensor:
-    """‖cof J / χ‖², which is ‖J⁻¹‖² for χ = det J; squared last, so that it does not overflow."""
+def _squared_inverse(J: Tensor, chi: Tensor, norm: Tensor) -> Tensor:
+    """‖cof J / χ‖², which is ‖J⁻¹‖² for χ = det J; χ² never appears, which would leave the range.
+
+    Args:
+        J: (…, c, d).
+        chi: χ(det J).
+        norm: ‖J‖², which is ‖cof J‖² for surfaces.
+    """
     if _shape(J)[1] == 2:
-        return _squared_norm(J / chi[..., None, None])
+        return norm / chi / chi
     a, b, c = J.unbind(-1)
     cross = torch.linalg.cross
     cofactors = torch.stack([cross(b, c), cross(c, a), cross(a, b)], dim=-1)
@@ -199,7 +213,7 @@ def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
 
 def similarity_parts(J: Tensor) -> tuple[Tensor, Tensor]:
     """J = similarity + anti-similarity, as vectors of length σ₁ + σ₂ and σ₁ - σ₂."""
-    a, b, c, d = J.flatten(-2).unbind(-1)
+    a, b, c, d = _entries(J)
     return torch.stack([a + d, c - b], dim=-1), torch.stack([a - d, c + b], dim=-1)
 
 

@@ -104,8 +104,7 @@ def arap(J: Jacobian) -> Density:
     """As-rigid-as-possible, Σ (σᵢ - 1)² = min over rotations Q of ‖J - Q‖² (Liu et al. 2008)."""
     if _shape(J) == (3, 3):
         return (singular_values(J) - 1).square().sum(-1)
-    total, _ = _sum_and_difference(J)
-    return _squared_norm(J) - 2 * total + 2
+    return _squared_norm(J) - 2 * _sum(J) + 2
 
 
 def lscm(J: Jacobian) -> Density:
@@ -206,9 +205,21 @@ def _sum_and_difference(J: Tensor) -> tuple[Tensor, Tensor]:
     """σ₁ + σ₂ and σ₁ - σ₂, each without cancellation; subgradient zero where a norm vanishes."""
     if _shape(J) == (3, 2):
         return _spatial_sum_and_difference(J)
-    similarity, anti_similarity = similarity_parts(J)
-    norm = torch.linalg.vector_norm
-    return norm(similarity, dim=-1), norm(anti_similarity, dim=-1)
+    a, b, c, d = _entries(J)
+    return _length(a + d, c - b), _length(a - d, c + b)
+
+
+def _sum(J: Tensor) -> Tensor:
+    """σ₁ + σ₂ alone."""
+    if _shape(J) == (3, 2):
+        return _spatial_sum_and_difference(J)[0]
+    a, b, c, d = _entries(J)
+    return _length(a + d, c - b)
+
+
+def _length(x: Tensor, y: Tensor) -> Tensor:
+    """√(x² + y²), subgradient zero at zero."""
+    return torch.linalg.vector_norm(torch.stack([x, y], dim=-1), dim=-1)
 
 
 def similarity_parts(J: Tensor) -> tuple[Tensor, Tensor]:

@@ -65,3 +65,11 @@ def test_nothing_is_fetched_from_elsewhere(site):
         for address in loaded:
             assert "//" not in address
             assert (page.parent / address.split("?")[0]).is_file()
+
+
+@pytest.mark.slow
+def test_formulas_are_formulas(site):
+    """MathML, without a command that the converter did not know and left as it was."""
+    formulas = re.findall(r"<math.*?</math>", (site / "mathematics.html").read_text(), re.DOTALL)
+    assert len(formulas) > 20
+    assert not any("\\" in formula.replace("\\,", "") for formula in formulas)

@@ -56,11 +56,9 @@ def move_links(app: Sphinx, path: Path, parent: str, content: list[str]) -> None
 
     def moved(link: re.Match[str]) -> str:
         target = link[1]
-        if target in PAGES:
-            return f"]({PAGES[target]})"
-        return (
-            f"]({target.removeprefix('docs/') if target.startswith('docs/') else '../' + target})"
-        )
+        if target.startswith("docs/"):
+            return f"]({target.removeprefix('docs/')})"
+        return f"]({PAGES.get(target, f'../{target}')})"
 
     content[0] = re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", moved, content[0])
 

@@ -1,6 +1,6 @@
 """For tests of code that works on meshes: small meshes of every kind, and invariances to assert.
 
-Not imported by `import diffpoisson`; needs hypothesis.
+Not imported by `import diffpoisson`; needs hypothesis. In a test::
 
     from hypothesis import given
     from diffpoisson import testing

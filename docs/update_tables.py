@@ -232,6 +232,20 @@ def uv_card() -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
 
 
+def notices() -> str:
+    """Where the meshes come from that the shipped weights were trained on."""
+    weights = DOCS.parent / "njf_models" / "weights"
+    meshes = json.loads((weights / "uv.json").read_text())["meshes"]
+    sources = Counter(
+        (source.split(":")[0].split("(seed")[0], terms) for _, terms, source in meshes
+    )
+    rows = [
+        f"| {source} | {terms} | {count} |"
+        for (source, terms), count in sorted(sources.items(), key=lambda row: (-row[1], row[0]))
+    ]
+    return "\n".join(["| source | licence | meshes, with bent copies |", "|---|---|---|", *rows])
+
+
 def data_cost() -> str:
     """Stages and bytes of UV training data, from `tests/benchmarks/data_cost.py`."""
     result = json.loads((RESULTS / "data_cost.json").read_text())
@@ -262,6 +276,7 @@ TABLES = {
     "data_cost": data_cost,
     "uv": uv,
     "uv_card": uv_card,
+    "notices": notices,
     "cli_trial": cli_trial,
     "uv_robustness": uv_robustness,
     "uv_overlap": uv_overlap,

@@ -64,16 +64,29 @@ class FieldMLP(nn.Module):
         of_code, of_features = weight.split((self.code_size, features.shape[-1]), dim=1)
         per_code = functional.linear(code, of_code, bias)
 
-        def outputs(from_code: Tensor, features: Tensor) -> Tensor:
-            x = _scaled_relu(from_code + functional.linear(features, of_features), norm)
+        def outputs(x: Tensor) -> Tensor:
+            x = _scaled_relu(x, norm)
             for weight, bias, scale in others:
                 x = _scaled_relu(functional.linear(x, weight, bias), scale)
             return self.layers[-1](x)
 
-        if part_of_face is None:
-            return outputs(per_code[..., None, :], features)
-        pieces = [slice(start, start + _ROWS) for start in range(0, len(features), _ROWS)]
-        return torch.cat([outputs(per_code[part_of_face[p]], features[p]) for p in pieces])
+        if part_of_face is not None:
+            return torch.cat(
+                [
+                    outputs(per_code[part_of_face[p]] + functional.linear(features[p], of_features))
+                    for p in _pieces(len(features), _ROWS)
+                ]
+            )
+        per_face = functional.linear(features, of_features)
+        batch, (n_faces, width) = per_code.shape[:-1], per_face.shape[-2:]
+        per_code = per_code.reshape(-1, 1, width)
+        if per_face.ndim > 2:
+            per_face = per_face.expand(*batch, -1, -1).reshape(-1, n_faces, width)
+        pieces = _pieces(len(per_code), max(1, _ROWS // max(1, n_faces)))
+        rows = [
+            outputs(per_code[p] + (per_face[p] if per_face.ndim > 2 else per_face)) for p in pieces
+        ]
+        return torch.cat(rows).unflatten(0, batch) if batch else torch.cat(rows)[0]
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""
@@ -82,6 +95,11 @@ class FieldMLP(nn.Module):
             assert isinstance(linear, nn.Linear)
             assert isinstance(norm, nn.GroupNorm)
             yield _centred(linear.weight, norm), _centred(linear.bias, norm), norm
+
+
+def _pieces(length: int, size: int) -> list[slice]:
+    """Consecutive slices; one, though empty, of nothing."""
+    return [slice(start, start + size) for start in range(0, max(length, 1), size)]
 
 
 def _centred(values: Float[Tensor, "channels *any"], norm: nn.GroupNorm) -> Tensor:

@@ -146,33 +146,46 @@ class BodySettings:
             different seeds give training, validation and test sets apart in both.
         n_poses: of each identity.
         heading: largest turn about the vertical, in radians; see `poses.sample_pose`.
-        max_intersecting: poses in which a larger share of the faces cuts others are drawn again.
+        max_intersecting: poses in which a larger share of the faces cuts others are drawn again,
+            and so is an identity whose rest pose is one. An arm through the trunk is 0.3% of the
+            faces; of random poses, 88% have none.
     """
 
     seed: int = 0
     n_poses: int = 32
     heading: float = 0.0
-    max_intersecting: float = 0.01
+    max_intersecting: float = 0.0
 
 
 def draw_body(
     model: BodyModel, triangulation: Triangulation, settings: BodySettings, number: int
 ) -> Body:
-    """Identity number `number` of a data set, in poses without deep self-intersections."""
+    """Identity number `number` of a data set, in poses without self-intersections."""
     rng = np.random.default_rng([settings.seed, number])
-    phenotype = torch.tensor([rng.uniform(*limits) for limits in PHENOTYPES.values()])
-    poses: list[Tensor] = [torch.zeros(POSE_SIZE)]
-    vertices = [model.vertices(phenotype, poses[0][None])[0]]
-    while len(poses) <= settings.n_poses:
+    rest = None
+    while rest is None:
+        phenotype = torch.tensor([rng.uniform(*limits) for limits in PHENOTYPES.values()])
+        rest = _screened(model, phenotype, torch.zeros(POSE_SIZE), settings)
+    poses: list[Tensor] = []
+    vertices = [rest]
+    while len(poses) < settings.n_poses:
         pose = torch.from_numpy(sample_pose(rng, settings.heading)).float().flatten()
-        posed = model.vertices(phenotype, pose[None])[0]
-        if model.intersecting(posed) <= settings.max_intersecting:
+        posed = _screened(model, phenotype, pose, settings)
+        if posed is not None:
             poses.append(pose)
             vertices.append(posed)
     rest, *others = triangulation.deformed(torch.stack(vertices).double()).float()
     return Body(
-        number, phenotype, triangulation.faces, rest, torch.stack(poses[1:]), torch.stack(others)
+        number, phenotype, triangulation.faces, rest, torch.stack(poses), torch.stack(others)
     )
+
+
+def _screened(
+    model: BodyModel, phenotype: Tensor, pose: Tensor, settings: BodySettings
+) -> Tensor | None:
+    """Vertices in a pose, unless too many faces cut each other."""
+    vertices = model.vertices(phenotype, pose[None])[0]
+    return vertices if model.intersecting(vertices) <= settings.max_intersecting else None
 
 
 # -------------------------------------------------------------------- files

@@ -196,13 +196,14 @@ class BodyStore:
 
     Args:
         folder: as `build_bodies` made it.
+        n_bodies: read the first only; all of them if omitted.
 
     Raises:
         StoreError: there are no bodies in it.
     """
 
-    def __init__(self, folder: Path | str) -> None:
-        self.paths = sorted(Path(folder).glob("body-*.safetensors"))
+    def __init__(self, folder: Path | str, n_bodies: int | None = None) -> None:
+        self.paths = sorted(Path(folder).glob("body-*.safetensors"))[:n_bodies]
         if not self.paths:
             raise StoreError(f"{folder} holds no bodies: make some with build_bodies")
 
@@ -226,8 +227,8 @@ def build_bodies(
     """A data set of bodies on one decimated triangulation; the average body's, for all of them.
 
     Bodies that are there already are kept: an interrupted call goes on where it stopped when it is
-    repeated, and a call with more bodies adds to a data set. Where nothing is missing, anny is not
-    needed.
+    repeated, and a call with more bodies adds to a data set, whose first ones stay the same. Where
+    nothing is missing, anny is not needed.
 
     Args:
         folder: of the data set.
@@ -249,7 +250,7 @@ def build_bodies(
         for number in tqdm(missing, desc="bodies", disable=not progress):
             body = draw_body(model, triangulation, settings, number)
             write_atomically(_path(folder, number), _encode(body, key))
-    return BodyStore(folder)
+    return BodyStore(folder, n_bodies)
 
 
 def _path(folder: Path, number: int) -> Path:

@@ -144,7 +144,8 @@ def test_a_store_grows_and_keeps_what_it_has(tmp_path, monkeypatch):
     times = [path.stat().st_mtime_ns for path in first.paths]
     more = build_bodies(tmp_path, 3, 400, SETTINGS, progress=False)
     assert [path.stat().st_mtime_ns for path in more.paths[:2]] == times
-    assert len(more) == 3
+    assert len(more) == len(BodyStore(tmp_path)) == 3
+    assert len(build_bodies(tmp_path, 2, 400, SETTINGS, progress=False)) == 2
     assert more[2].number == 2
     body = more[1]
     assert body.faces.shape == (400, 3)

@@ -9,7 +9,8 @@ is built for the first time; `--full` has the paper's code and points, and takes
 it again after an interruption, and it goes on where it stopped. The paper's bodies, STAR, are
 licensed and can't be had here: compare ratios with its figures, not errors.
 
-Writes to the folder `--out`: results.png, results.json, the bodies, training logs and checkpoints.
+Writes to the folder `--out`: results.png, results.json, maps.json (the errors of each test map),
+the bodies, training logs and checkpoints.
 """
 
 from __future__ import annotations
@@ -58,14 +59,17 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     table |= {title: summarise(of_model) for title, of_model in records.items()}
     print("\nUnseen bodies and poses:\n" + format_table(table))
     results = {
-        "options": {name: str(value) for name, value in vars(options).items()},
+        "options": {
+            name: value for name, value in vars(options).items() if not isinstance(value, Path)
+        },
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
         "training": costs,
         "summary": table,
-        "maps": {title: [asdict(r) for r in of_model] for title, of_model in records.items()},
     }
     (options.out / "results.json").write_text(json.dumps(results, indent=1))
+    every = {title: [asdict(record) for record in of_model] for title, of_model in records.items()}
+    (options.out / "maps.json").write_text(json.dumps(every))
     draw(options.out / "results.png", test, maps, records)
     print(f"\n{options.out / 'results.png'}  {options.out / 'results.json'}")
     return table

@@ -133,18 +133,21 @@ def evaluate_reposing(
 
 
 def summarise(records: Sequence[PoseRecord]) -> dict[str, float]:
-    """Means over all maps."""
+    """Means over all maps, and the spread of L2-V."""
 
-    def mean(name: str) -> float:
-        return float(np.mean([getattr(record, name) for record in records]))
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(record, name) for record in records])
 
-    return {
-        "maps": float(len(records)),
-        "L2-V": mean("l2_v"),
-        "L2-J": mean("l2_j"),
-        "L2-J of the emitted map": mean("l2_j_emitted"),
-        "L2-N, degrees": mean("l2_n"),
+    summary = {
+        "maps": len(records),
+        "L2-V": column("l2_v").mean(),
+        "L2-V, median": np.median(column("l2_v")),
+        "L2-V, 90%": np.percentile(column("l2_v"), 90),
+        "L2-J": column("l2_j").mean(),
+        "L2-J, emitted": column("l2_j_emitted").mean(),
+        "L2-N, degrees": column("l2_n").mean(),
     }
+    return {name: float(value) for name, value in summary.items()}
 
 
 def _records(number: int, batch: Batch, prediction: Prediction) -> list[PoseRecord]:

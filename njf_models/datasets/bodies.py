@@ -8,7 +8,7 @@ once, with all of its poses, and kept in a file, so that one source serves many 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -186,6 +186,13 @@ def _screened(
     """Vertices in a pose, unless too many faces cut each other."""
     vertices = model.vertices(phenotype, pose[None])[0]
     return vertices if model.intersecting(vertices) <= settings.max_intersecting else None
+
+
+def retriangulated(model: BodyModel, triangulation: Triangulation, body: Body) -> Body:
+    """The same identity in the same poses, on another triangulation."""
+    poses = torch.cat([torch.zeros(1, POSE_SIZE), body.poses])
+    vertices = triangulation.deformed(model.vertices(body.phenotype, poses).double()).float()
+    return replace(body, faces=triangulation.faces, rest=vertices[0], posed=vertices[1:])
 
 
 # -------------------------------------------------------------------- files

@@ -55,20 +55,50 @@ class Triangulation:
         return cls(reference, dp.SurfaceSamples(torch.from_numpy(at).long(), barycentric), faces)
 
     @classmethod
-    def decimated(cls, reference: dp.Mesh, n_faces: int) -> Triangulation:
+    def decimated(cls, reference: dp.Mesh, n_faces: int, grading: float = 0.0) -> Triangulation:
         """Edges collapsed in the order of their quadric error (Garland and Heckbert 1997).
+
+        Args:
+            reference: the surface.
+            n_faces: how many faces to leave.
+            grading: natural logarithm of how much shorter edges are at the top than at the bottom.
 
         Raises:
             ValueError: no more edges could be collapsed before so few faces were left.
         """
-        V, F = reference.vertices.double().numpy(), reference.faces.numpy().astype(np.int32)
+        stretched = _stretched(reference, grading)
+        V, F = stretched.vertices.numpy(), stretched.faces.numpy().astype(np.int32)
         vertices, faces, _, _ = igl.qslim(np.asfortranarray(V), np.asfortranarray(F), n_faces)
         if len(faces) > n_faces:
             raise ValueError(
                 f"Triangulation.decimated: {len(faces)} faces are left, not {n_faces}; ask for more"
             )
-        return cls.embedded(reference, *(torch.from_numpy(x.copy()) for x in (vertices, faces)))
+        vertices, faces = (torch.from_numpy(array.copy()) for array in (vertices, faces))
+        return cls(reference, cls.embedded(stretched, vertices, faces).points, faces)
+
+    def subdivided(self) -> Triangulation:
+        """One step of Loop's subdivision, whose vertices are moved back to the reference."""
+        vertices, faces = igl.loop(
+            self.deformed(self.reference.vertices.double()).numpy(), self.faces.numpy()
+        )
+        smooth, faces = torch.from_numpy(vertices.copy()), torch.from_numpy(faces.copy()).long()
+        return Triangulation.embedded(self.reference, smooth, faces)
 
     def deformed(self, values: Float[Tensor, "*batch N c"]) -> Float[Tensor, "*batch n c"]:
         """Values at these vertices, from those at the reference's, such as its other positions."""
         return self.points.interpolate(self.reference, values)
+
+
+def _stretched(reference: dp.Mesh, grading: float) -> dp.Mesh:
+    """The surface in float64, scaled up by e^grading at its top as compared to its bottom.
+
+    Space is mapped by (x, y, z) ↦ (s x, s y, ∫ s dz) with s = e^(k z), so that all directions are
+    scaled alike where x and y are small.
+    """
+    x = reference.vertices.double()
+    if not grading:
+        return dp.Mesh(x, reference.faces)
+    low, high = x[:, 2].min(), x[:, 2].max()
+    k = grading / (high - low)
+    scale = (k * (x[:, 2:] - low)).exp()
+    return dp.Mesh(torch.cat([scale * x[:, :2], (scale - 1) / k], dim=1), reference.faces)

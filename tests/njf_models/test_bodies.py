@@ -20,6 +20,7 @@ from njf_models.datasets.bodies import (
     BodyStore,
     build_bodies,
     draw_body,
+    retriangulated,
 )
 from njf_models.datasets.poses import JOINTS
 from njf_models.datasets.store import StoreError
@@ -110,6 +111,16 @@ def test_bodies_differ_by_number_and_seed_and_by_nothing_else(model, coarse):
         assert (other.poses - body.poses).abs().amax(1).min() > 0.05
     low, high = torch.tensor(list(PHENOTYPES.values())).T
     assert ((low <= body.phenotype) & (body.phenotype <= high)).all()
+
+
+def test_a_body_on_another_triangulation_is_the_one_drawn_on_it(model, coarse):
+    other = Triangulation.decimated(model.reference, 700, grading=1.0)
+    body = retriangulated(model, other, draw_body(model, coarse, SETTINGS, 4))
+    drawn = draw_body(model, other, SETTINGS, 4)
+    assert body.number == 4
+    assert (body.faces == other.faces).all()
+    assert_close(body.rest, drawn.rest, rtol=0, atol=1e-6)
+    assert_close(body.posed, drawn.posed, rtol=0, atol=1e-6)
 
 
 def test_a_body_is_what_its_parameters_say(model, coarse):

@@ -62,6 +62,36 @@ def test_weights_are_barycentric_also_on_edges_and_corners(reference):
     assert_close(at.deformed(reference.vertices)[:50], corners, rtol=0, atol=1e-14)
 
 
+def test_grading_makes_faces_small_at_the_top(reference):
+    graded = Triangulation.decimated(reference, 300, grading=2.0)
+    mesh = dp.Mesh(graded.deformed(reference.vertices), graded.faces)
+    z = reference.vertices[:, 2]
+    height = (mesh.centroids[:, 2] - z.min()) / (z.max() - z.min())
+    top, bottom = mesh.areas[height > 0.8].mean(), mesh.areas[height < 0.2].mean()
+    assert 2 * 0.6 < float((bottom / top).log()) < 2 * 2.0  # areas go with squares of lengths
+    moved = bent(reference.vertices)
+    squared = igl.point_mesh_squared_distance(
+        graded.deformed(moved).numpy(), moved.numpy(), reference.faces.numpy()
+    )[0]
+    assert np.sqrt(squared.max()) < 1e-12
+
+
+def test_subdivision_quadruples_faces_and_brings_them_closer(reference):
+    """Of a ball, whose volume the chords of a coarse mesh miss by four times as much."""
+    x = reference.vertices
+    ball = dp.Mesh(x / torch.linalg.vector_norm(x, dim=1, keepdim=True), reference.faces)
+
+    def volume(triangulation):
+        a, b, c = triangulation.deformed(ball.vertices)[triangulation.faces].unbind(1)
+        return float((torch.linalg.cross(a, b) * c).sum() / 6)
+
+    coarse = Triangulation.decimated(ball, 80)
+    fine = coarse.subdivided()
+    assert fine.faces.shape == (320, 3)
+    whole = volume(Triangulation.original(ball))
+    assert 0 < whole - volume(fine) < 0.4 * (whole - volume(coarse))
+
+
 def test_too_few_faces_raise(reference):
     with pytest.raises(ValueError, match=r"decimated: \d+ faces are left, not 1; ask for more"):
         Triangulation.decimated(reference, 1)

@@ -231,6 +231,62 @@ def uv_card() -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
 
 
+def repose() -> str:
+    """Re-posing of unseen bodies, from `examples/repose.py`."""
+    results = json.loads((RESULTS / "repose.json").read_text())
+    untrained, theirs, ours = (
+        results["summary"][name] for name in ("untrained", "displacement", "ours")
+    )
+    paper = {"L2-V": (4.21, 0.84)}  # from the T-pose: displacements, ours
+    options, costs = results["options"], results["training"]
+    lines = [
+        f"| {ours['maps']:.0f} maps of {options['held_out']} unseen bodies | untrained: identity "
+        "| displacement field | ours | ratio | paper, STAR: displacement field / ours, ratio |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, value in ours.items():
+        if name != "maps":
+            cells = [number(x) for x in (untrained[name], theirs[name], value)]
+            other = "–"
+            if name in paper:
+                other = "{} / {}, ".format(*paper[name]) + number(paper[name][0] / paper[name][1])
+            lines.append(
+                f"| {name} | {' | '.join(cells)} | {number(theirs[name] / value)} | {other} |"
+            )
+    spent = "; ".join(
+        f"{name}: {c['steps']:,} steps, {c['cpu seconds'] / 60:.1f} minutes of CPU time"
+        for name, c in costs.items()
+    )
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Trained on {options['bodies']} bodies in {options['poses']} poses each, of "
+            f"{options['faces']:,} faces, {options['targets']} poses a step, code of size "
+            f"{options['code_size']}, one seed. {spent[0].upper()}{spent[1:]}.",
+        ]
+    )
+
+
+def triangulations() -> str:
+    """Maps of the same bodies on several triangulations, from `examples/triangulations.py`."""
+    results = json.loads((RESULTS / "triangulations.json").read_text())
+    ours, theirs = (results["deviations"][name] for name in ("ours", "displacement"))
+    lines = [
+        "| triangulation | faces | error, mm | deviation, mm | deviation / own error, % "
+        "| the same, displacement field |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in ours.items():
+        cells = (1000 * row["error"], 1000 * row["deviation"], 100 * row["share"])
+        lines.append(
+            f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} "
+            f"| {number(100 * theirs[name]['share'])} |"
+        )
+    about = f"{results['bodies']} unseen bodies in {results['poses']} poses each."
+    return "\n".join([*lines, "", about])
+
+
 def data_cost() -> str:
     """Stages and bytes of UV training data, from `tests/benchmarks/data_cost.py`."""
     result = json.loads((RESULTS / "data_cost.json").read_text())
@@ -258,6 +314,8 @@ def data_cost() -> str:
 
 
 TABLES = {
+    "repose": repose,
+    "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,
     "uv_card": uv_card,

@@ -8,6 +8,7 @@ once, with all of its poses, and kept in a file, so that one source serves many 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -221,6 +222,9 @@ class BodyStore:
         arrays = _read(self.paths[index])[0]
         arrays["faces"] = arrays["faces"].long()
         return Body(number=int(self.paths[index].stem.split("-")[1]), **arrays)
+
+    def __iter__(self) -> Iterator[Body]:
+        return (self[i] for i in range(len(self)))
 
 
 def build_bodies(

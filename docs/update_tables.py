@@ -234,25 +234,20 @@ def uv_card() -> str:
 def repose() -> str:
     """Re-posing of unseen bodies, from `examples/repose.py`."""
     results = json.loads((RESULTS / "repose.json").read_text())
-    untrained, theirs, ours = (
-        results["summary"][name] for name in ("untrained", "displacement", "ours")
-    )
-    paper = {"L2-V": (4.21, 0.84)}  # from the T-pose: displacements, ours
-    options, costs = results["options"], results["training"]
-    lines = [
-        f"| {ours['maps']:.0f} maps of {options['held_out']} unseen bodies | untrained: identity "
-        "| displacement field | ours | ratio | paper, STAR: displacement field / ours, ratio |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name, value in ours.items():
+    summary, options, costs = (results[name] for name in ("summary", "options", "training"))
+    paper = {"ours": 0.84, "displacement": 4.21, "cages": 3.87}  # L2-V from the T-pose
+    theirs = [name for name in summary if name not in ("untrained", "ours")]
+    head = ["untrained: identity", "ours", *theirs, *(f"{name} / ours" for name in theirs)]
+    maps = f"{summary['ours']['maps']:.0f} maps of {options['held_out']} unseen bodies"
+    lines = [f"| {maps} | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
+    for name, ours in summary["ours"].items():
         if name != "maps":
-            cells = [number(x) for x in (untrained[name], theirs[name], value)]
-            other = "–"
-            if name in paper:
-                other = "{} / {}, ".format(*paper[name]) + number(paper[name][0] / paper[name][1])
-            lines.append(
-                f"| {name} | {' | '.join(cells)} | {number(theirs[name] / value)} | {other} |"
-            )
+            others = [summary[other][name] for other in theirs]
+            cells = [summary["untrained"][name], ours, *others, *(x / ours for x in others)]
+            lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
+    figures = [paper["ours"], *(paper[name] for name in theirs)]
+    figures += [x / paper["ours"] for x in figures[1:]]
+    lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(map(number, figures))} |")
     spent = "; ".join(
         f"{name}: {c['steps']:,} steps, {c['cpu seconds'] / 60:.1f} minutes of CPU time"
         for name, c in costs.items()
@@ -271,18 +266,14 @@ def repose() -> str:
 def triangulations() -> str:
     """Maps of the same bodies on several triangulations, from `examples/triangulations.py`."""
     results = json.loads((RESULTS / "triangulations.json").read_text())
-    ours, theirs = (results["deviations"][name] for name in ("ours", "displacement"))
-    lines = [
-        "| triangulation | faces | error, mm | deviation, mm | deviation / own error, % "
-        "| the same, displacement field |",
-        "|---|---|---|---|---|---|",
-    ]
+    ours = results["deviations"].pop("ours")
+    head = ["faces", "error, mm", "deviation, mm", "deviation / own error, %"]
+    head += [f"the same, {name}" for name in results["deviations"]]
+    lines = [f"| triangulation | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
     for name, row in ours.items():
-        cells = (1000 * row["error"], 1000 * row["deviation"], 100 * row["share"])
-        lines.append(
-            f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} "
-            f"| {number(100 * theirs[name]['share'])} |"
-        )
+        cells = [1000 * row["error"], 1000 * row["deviation"], 100 * row["share"]]
+        cells += [100 * others[name]["share"] for others in results["deviations"].values()]
+        lines.append(f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} |")
     about = f"{results['bodies']} unseen bodies in {results['poses']} poses each."
     return "\n".join([*lines, "", about])
 

@@ -1,8 +1,9 @@
-"""Re-pose human bodies from pose parameters: a Neural Jacobian Field beside a displacement field.
+"""Re-pose human bodies from pose parameters: a Neural Jacobian Field beside two baselines.
 
 Random bodies → poses inside joint limits → training on one source and many targets a step, the
 source seen by PointNet, the target told by its pose parameters → evaluation on bodies and poses
-that were never seen. Both models have the same data, code and loss, and the same CPU time.
+that were never seen. The baselines, a displacement field and Neural Cages, have the same data, code
+and loss, and the same CPU time.
 
 The default takes about fifteen minutes on two cores, and a minute or two more when the body model
 is built for the first time; `--full` has the paper's code and points, and takes days on a CPU. Run
@@ -35,7 +36,7 @@ from njf_models.evaluation import format_table
 from njf_models.reposing import PoseRecord, RestToPoses, body_loader, evaluate_reposing, summarise
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 
-KINDS = {"njf": "ours", "displacement": "displacement"}  # by the name in tables
+KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
 PAPER = {"bodies": 2000, "poses": 32, "code_size": 1000, "points": 1024, "targets": 32}
 N_VALIDATIONS = 10
 
@@ -49,7 +50,8 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     train, validation, test = make_bodies(options)
     steps = plan(train, options)
     records, maps, costs = {}, {}, {}
-    for kind, title in KINDS.items():
+    for kind in options.models:
+        title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
         costs[title] = {"steps": steps[kind], **cost(checkpoint)}
         examples = RestToPoses(test, **inputs(options))
@@ -91,6 +93,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--code-size", type=int, default=256, help="of PointNet's code (256)")
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
     add("--energies", type=int, default=50, metavar="N", help="of the wave-kernel signature (50)")
+    add("--models", nargs="+", choices=KINDS, default=list(KINDS), help="which to train (all)")
     add("--full", action="store_true", help=f"the paper's scale: {PAPER}, 200,000 steps")
     add("--seed", type=int, default=0)
     options = parser.parse_args(argv)
@@ -134,13 +137,18 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
 def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, int]:
     """Steps of each model that cost as much CPU time; decided once for a folder of results."""
     path = options.out / "steps.json"
-    if not path.exists():
+    steps = json.loads(path.read_text()) if path.exists() else {}
+    if missing := [kind for kind in options.models if kind not in steps]:
         batch = RestToPoses([train[0]], n_targets=options.targets, **inputs(options))[0]
-        seconds = {kind: seconds_per_step(make_module(kind, 1, options), batch) for kind in KINDS}
-        steps = {kind: options.steps * seconds["njf"] / seconds[kind] for kind in KINDS}
-        # Multiples of the validations, so that the last step is followed by one.
-        path.write_text(json.dumps({k: N_VALIDATIONS * round(n / 10) for k, n in steps.items()}))
-    return json.loads(path.read_text())
+        ours = seconds_per_step(make_module("njf", 1, options), batch)
+        for kind in missing:
+            n = options.steps * ours / seconds_per_step(make_module(kind, 1, options), batch)
+            # A multiple of the validations, so that one follows the last step.
+            steps[kind] = (
+                options.steps if kind == "njf" else N_VALIDATIONS * round(n / N_VALIDATIONS)
+            )
+        path.write_text(json.dumps(steps))
+    return steps
 
 
 def seconds_per_step(module: NJFTraining, batch: Any) -> float:

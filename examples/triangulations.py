@@ -23,7 +23,7 @@ from njf_models.datasets.triangulation import Triangulation
 from njf_models.training import NJFTraining
 from njf_models.uv_network import Inputs
 
-KINDS = {"njf": "ours", "displacement": "displacement"}  # by the name in tables
+KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
 
 
 def main(argv: list[str] | None = None) -> dict[str, dict[str, Deviation]]:
@@ -35,6 +35,8 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Deviation]]:
     table = {}
     for kind, title in KINDS.items():
         checkpoint = options.run / kind / "checkpoints" / "best.ckpt"
+        if not checkpoint.exists():
+            continue
         module = NJFTraining.load_from_checkpoint(checkpoint, map_location="cpu").eval()
         table[title] = compare_triangulations(
             module.model,

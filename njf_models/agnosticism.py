@@ -10,11 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 import diffpoisson as dp
-from njf_models.baselines.displacement import DisplacementField
 from njf_models.datasets.bodies import Body, BodyModel, retriangulated
 from njf_models.datasets.triangulation import Triangulation
-from njf_models.njf import NeuralJacobianField
 from njf_models.reposing import RestToPoses
+from njf_models.training import Model
 from njf_models.uv_network import Inputs
 
 
@@ -37,7 +36,7 @@ class Deviation:
 
 @torch.no_grad()
 def compare_triangulations(
-    model: NeuralJacobianField | DisplacementField,
+    model: Model,
     inputs: Inputs,
     *,
     body_model: BodyModel,
@@ -74,9 +73,7 @@ def compare_triangulations(
     return deviations
 
 
-def _map(
-    model: NeuralJacobianField | DisplacementField, body: Body, inputs: Inputs
-) -> Float[Tensor, "t n 3"]:
+def _map(model: Model, body: Body, inputs: Inputs) -> Float[Tensor, "t n 3"]:
     """The map of a body to each of its poses."""
     examples = RestToPoses(
         [body],

@@ -12,12 +12,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from njf_models.baselines.displacement import DisplacementField
 from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.features import Shape, point_features
 from njf_models.metrics import l2_jacobians, l2_normals, l2_vertices
-from njf_models.njf import NeuralJacobianField, Prediction
-from njf_models.training import Batch
+from njf_models.njf import Prediction
+from njf_models.training import Batch, Model
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class PoseRecord:
 
 @torch.no_grad()
 def evaluate_reposing(
-    model: NeuralJacobianField | DisplacementField, examples: RestToPoses
+    model: Model, examples: RestToPoses
 ) -> tuple[list[PoseRecord], list[Float[Tensor, "t n 3"]]]:
     """The maps of each body to its poses: the records, and the maps by body."""
     was_training = model.training

@@ -24,6 +24,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
+from njf_models.baselines.cages import CageDeformation
 from njf_models.baselines.displacement import DisplacementField
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
@@ -196,7 +197,12 @@ class _Stopwatch:
         self.earlier, self.started = self.seconds, None
 
 
-MODELS = {"njf": NeuralJacobianField, "displacement": DisplacementField}
+Model = NeuralJacobianField | DisplacementField | CageDeformation
+MODELS: dict[str, type[Model]] = {
+    "njf": NeuralJacobianField,
+    "displacement": DisplacementField,
+    "cages": CageDeformation,
+}
 
 
 class NJFTraining(lightning.LightningModule):
@@ -370,6 +376,6 @@ def last_checkpoint(folder: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def load_checkpoint(path: Path) -> NeuralJacobianField | DisplacementField:
+def load_checkpoint(path: Path) -> Model:
     """The network in a checkpoint of `NJFTraining`, ready for inference."""
     return NJFTraining.load_from_checkpoint(path, map_location="cpu").model.eval()

@@ -38,7 +38,7 @@ def test_repose_and_triangulations(tmp_path):
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["summary"] == table
     assert results["training"]["ours"]["steps"] == 60
-    for name in ("ours", "displacement"):
+    for name in ("ours", "displacement", "cages"):
         assert table[name]["maps"] == 2 * 4
         assert table[name]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
         assert results["training"][name]["cpu seconds"] > 0

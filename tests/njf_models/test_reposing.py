@@ -67,7 +67,7 @@ def test_training_sees_all_poses_in_turn_and_evaluation_always_the_same(bodies):
     assert fresh[0].shape is fresh[0].shape  # factorised once
 
 
-@pytest.mark.parametrize("kind", ["njf", "displacement"])
+@pytest.mark.parametrize("kind", ["njf", "displacement", "cages"])
 def test_a_batch_has_the_loss_and_gradient_of_the_mean_over_its_targets(bodies, kind):
     batch = RestToPoses(bodies, **INPUTS)[0]
     model = NJFTraining(MODEL, kind=kind).model
@@ -93,7 +93,7 @@ def test_one_source_is_encoded_once_for_all_targets():
     assert code.shape == (4, 11)
 
 
-@pytest.mark.parametrize("kind", ["njf", "displacement"])
+@pytest.mark.parametrize("kind", ["njf", "displacement", "cages"])
 def test_training_learns_the_twist_and_resumes(bodies, tmp_path, kind):
     train, validation = bodies[:3], bodies[3:]
 
@@ -153,8 +153,8 @@ def test_records_of_a_known_map(bodies):
 
 
 def test_a_baseline_that_does_not_exist_and_turns_in_space_raise():
-    with pytest.raises(ValueError, match=r"kind must be one of \['displacement', 'njf'\]"):
-        NJFTraining(MODEL, kind="cages")
+    with pytest.raises(ValueError, match="kind must be one of"):
+        NJFTraining(MODEL, kind="best")
     with pytest.raises(ValueError, match="augment turns planar maps"):
         NJFTraining(MODEL, {"augment": True})
 

@@ -71,22 +71,20 @@ class FieldMLP(nn.Module):
             return self.layers[-1](x)
 
         if part_of_face is not None:
+            pieces = zip(features.split(_ROWS), part_of_face.split(_ROWS), strict=True)
             return torch.cat(
-                [
-                    outputs(per_code[part_of_face[p]] + functional.linear(features[p], of_features))
-                    for p in _pieces(len(features), _ROWS)
-                ]
+                [outputs(per_code[i] + functional.linear(x, of_features)) for x, i in pieces]
             )
         per_face = functional.linear(features, of_features)
         batch, (n_faces, width) = per_code.shape[:-1], per_face.shape[-2:]
-        per_code = per_code.reshape(-1, 1, width)
-        if per_face.ndim > 2:
-            per_face = per_face.expand(*batch, -1, -1).reshape(-1, n_faces, width)
-        pieces = _pieces(len(per_code), max(1, _ROWS // max(1, n_faces)))
-        rows = [
-            outputs(per_code[p] + (per_face[p] if per_face.ndim > 2 else per_face)) for p in pieces
-        ]
-        return torch.cat(rows).unflatten(0, batch) if batch else torch.cat(rows)[0]
+        n_codes = max(1, _ROWS // max(1, n_faces))
+        codes = per_code.reshape(-1, 1, width).split(n_codes)
+        if per_face.ndim == 2:
+            faces = [per_face] * len(codes)
+        else:
+            faces = per_face.expand(*batch, -1, -1).reshape(-1, n_faces, width).split(n_codes)
+        rows = torch.cat([outputs(c + f) for c, f in zip(codes, faces, strict=True)])
+        return rows.unflatten(0, batch) if batch else rows[0]
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""
@@ -95,11 +93,6 @@ class FieldMLP(nn.Module):
             assert isinstance(linear, nn.Linear)
             assert isinstance(norm, nn.GroupNorm)
             yield _centred(linear.weight, norm), _centred(linear.bias, norm), norm
-
-
-def _pieces(length: int, size: int) -> list[slice]:
-    """Consecutive slices; one, though empty, of nothing."""
-    return [slice(start, start + size) for start in range(0, max(length, 1), size)]
 
 
 def _centred(values: Float[Tensor, "channels *any"], norm: nn.GroupNorm) -> Tensor:

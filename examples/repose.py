@@ -31,9 +31,9 @@ import numpy as np
 import torch
 
 from njf_models.body_report import BodyRow, save_body_report
-from njf_models.datasets.bodies import POSE_SIZE, BodySettings, BodyStore, build_bodies
+from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
 from njf_models.evaluation import format_table
-from njf_models.reposing import PoseRecord, RestToPoses, body_loader, evaluate_reposing, summarise
+from njf_models.reposing import PoseExamples, PoseRecord, body_loader, evaluate_reposing, summarise
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 
 KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
@@ -54,7 +54,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
         title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
         costs[title] = {"steps": steps[kind], **cost(checkpoint)}
-        examples = RestToPoses(test, **inputs(options))
+        examples = examples_of(test, options)
         records[title], maps[title] = evaluate_reposing(load_checkpoint(checkpoint), examples)
 
     table = {"untrained": summarise(unmoved(options, test))}
@@ -88,6 +88,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--poses", type=int, default=16, metavar="N", help="of each (16)")
     add("--held-out", type=int, default=16, metavar="N", help="test identities (16)")
     add("--faces", type=int, default=2500, help="of the triangulation (2500)")
+    add("--sources", type=int, default=0, metavar="N", help="so many poses, not rest, as sources")
     add("--targets", type=int, default=8, metavar="N", help="poses per step (8)")
     add("--steps", type=int, default=1500, help="of the Neural Jacobian Field (1500)")
     add("--code-size", type=int, default=256, help="of PointNet's code (256)")
@@ -119,7 +120,22 @@ def make_bodies(options: argparse.Namespace) -> list[BodyStore]:
 
 
 def inputs(options: argparse.Namespace) -> dict[str, int]:
+    """What the networks see."""
     return {"n_points": options.points, "n_energies": options.energies}
+
+
+def examples_of(
+    bodies: BodyStore | list[Body], options: argparse.Namespace, *, training: bool = False
+) -> PoseExamples:
+    """Maps to learn or to evaluate."""
+    n_targets = options.targets if training else options.poses
+    return PoseExamples(
+        bodies,
+        sources=options.sources,
+        n_targets=n_targets,
+        resample=training,
+        **inputs(options),
+    )
 
 
 def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraining:
@@ -139,7 +155,7 @@ def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, int]:
     path = options.out / "steps.json"
     steps = json.loads(path.read_text()) if path.exists() else {}
     if missing := [kind for kind in options.models if kind not in steps]:
-        batch = RestToPoses([train[0]], n_targets=options.targets, **inputs(options))[0]
+        batch = examples_of([train[0]], options, training=True)[0]
         ours = seconds_per_step(make_module("njf", 1, options), batch)
         for kind in missing:
             n = options.steps * ours / seconds_per_step(make_module(kind, 1, options), batch)
@@ -172,11 +188,8 @@ def fit(
     trainer = make_trainer(folder, steps=steps, validate_every=steps // N_VALIDATIONS)
     trainer.fit(
         make_module(kind, steps, options),
-        body_loader(
-            RestToPoses(train, n_targets=options.targets, resample=True, **inputs(options)),
-            shuffle=True,
-        ),
-        body_loader(RestToPoses(validation, **inputs(options))),
+        body_loader(examples_of(train, options, training=True), shuffle=True),
+        body_loader(examples_of(validation, options)),
         ckpt_path=last_checkpoint(folder),
     )
     return folder / "checkpoints" / "best.ckpt"
@@ -190,9 +203,8 @@ def cost(checkpoint: Path) -> dict[str, float | None]:
 
 def unmoved(options: argparse.Namespace, test: BodyStore) -> list[PoseRecord]:
     """Errors of the identity map, which an untrained model is."""
-    return evaluate_reposing(
-        make_module("njf", 1, options).model, RestToPoses(test, **inputs(options))
-    )[0]
+    model = make_module("njf", 1, options).model
+    return evaluate_reposing(model, examples_of(test, options))[0]
 
 
 def draw(
@@ -201,20 +213,23 @@ def draw(
     maps: dict[str, list[torch.Tensor]],
     records: dict[str, list[PoseRecord]],
 ) -> None:
-    """Draw the test maps at three percentiles of our error, chosen by nothing else."""
+    """Draw the test maps at three percentiles of the first model's error, chosen by nothing else.
+
+    That is our model, unless it was left out.
+    """
+    images = {name: torch.cat(of_model) for name, of_model in maps.items()}
     first = next(iter(records.values()))
     order = np.argsort([record.l2_v for record in first])
     rows = []
     for percentile in (10, 50, 90):
         at = int(order[round(percentile / 100 * (len(order) - 1))])
-        chosen = first[at]
-        index = sum(record.pose == 0 for record in first[: at + 1]) - 1
-        body = test[index]
+        record = first[at]
+        body = test[record.body]
+        source = body.rest if record.source is None else body.posed[record.source]
         errors = ", ".join(f"{of_model[at].l2_v:.2f}" for of_model in records.values())
-        title = f"body {chosen.body}, pose {chosen.pose}: {percentile}th percentile\nL2-V {errors}"
-        predictions = {title: of_model[index][chosen.pose] for title, of_model in maps.items()}
-        target = body.posed[chosen.pose]
-        rows.append(BodyRow(title, body.faces, body.rest, target, predictions))
+        title = f"body {record.body}, pose {record.pose}: {percentile}th percentile\nL2-V {errors}"
+        predictions = {name: of_model[at] for name, of_model in images.items()}
+        rows.append(BodyRow(title, body.faces, source, body.posed[record.pose], predictions))
     save_body_report(rows, path)
 
 

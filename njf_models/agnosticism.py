@@ -12,7 +12,7 @@ from torch import Tensor
 import diffpoisson as dp
 from njf_models.datasets.bodies import Body, BodyModel, retriangulated
 from njf_models.datasets.triangulation import Triangulation
-from njf_models.reposing import RestToPoses
+from njf_models.reposing import PoseExamples
 from njf_models.training import Model
 from njf_models.uv_network import Inputs
 
@@ -75,7 +75,7 @@ def compare_triangulations(
 
 def _map(model: Model, body: Body, inputs: Inputs) -> Float[Tensor, "t n 3"]:
     """The map of a body to each of its poses."""
-    examples = RestToPoses(
+    examples = PoseExamples(
         [body],
         n_targets=len(body.poses),
         n_points=inputs.n_points,

@@ -1,13 +1,14 @@
-"""Re-posing bodies: batches of one source and many poses of it, and the errors of their maps."""
+"""Re-posing bodies: batches of one source and many targets, and the errors of their maps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -19,24 +20,30 @@ from njf_models.njf import Prediction
 from njf_models.training import Batch, Model
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """A source that was prepared once, and the targets of the same identity."""
+class _Source(NamedTuple):
+    """A source that was prepared once.
+
+    Attributes:
+        body: its identity.
+        shape: with operators and features.
+        wks: its wave-kernel signature, if the network sees one.
+    """
 
     body: Body
     shape: Shape
     wks: Float[Tensor, "n k"] | None
 
 
-class RestToPoses(Dataset[Batch]):
-    """For each body, maps from its rest pose to its other poses: one shape, one factor.
+class PoseExamples(Dataset[Batch]):
+    """Maps from one pose of a body to others of its poses: one shape and one factor a batch.
 
     Args:
         bodies: the identities.
-        n_targets: how many of its poses, at most.
+        sources: how many poses of each are sources, the first ones; 0 for the rest pose.
+        n_targets: how many other poses are targets, at most.
         n_points: how many points the encoder sees.
         n_energies: length of the wave-kernel signature that the network sees, 0 for none.
-        resample: draw points and poses anew at each access (training), or always the same points
+        resample: draw points and targets anew at each access (training), or always the same points
             and the first poses (evaluation).
     """
 
@@ -44,47 +51,56 @@ class RestToPoses(Dataset[Batch]):
         self,
         bodies: BodyStore | Sequence[Body],
         *,
+        sources: int = 0,
         n_targets: int = 32,
         n_points: int = 1024,
         n_energies: int = 50,
         resample: bool = False,
     ) -> None:
-        self.bodies, self.n_targets, self.resample = bodies, n_targets, resample
-        self.n_points, self.n_energies = n_points, n_energies
-        self._kept: dict[int, _Prepared] = {}
+        self.bodies, self.sources, self.resample = bodies, sources, resample
+        self.n_targets, self.n_points, self.n_energies = n_targets, n_points, n_energies
+        self._kept: dict[int, _Source] = {}
 
     def __len__(self) -> int:
-        return len(self.bodies)
+        return len(self.bodies) * max(1, self.sources)
 
     def body(self, index: int) -> Body:
         """The identity of a batch."""
         return self._prepared(index).body
 
-    def __getitem__(self, index: int) -> Batch:
-        source = self._prepared(index)
-        generator = None if self.resample else torch.Generator().manual_seed(index)
-        samples = dp.sample_surface(source.shape.mesh, self.n_points, generator=generator)
-        points = point_features(source.shape.mesh, samples, source.wks).float()
-        n_poses = len(source.body.poses)
-        order = torch.randperm(n_poses) if self.resample else torch.arange(n_poses)
-        chosen = order[: self.n_targets]
-        return Batch(
-            source.shape, points[None], source.body.posed[chosen], source.body.poses[chosen]
-        )
+    def source(self, index: int) -> int | None:
+        """The number of the source's pose; None for the rest pose."""
+        return index % self.sources if self.sources else None
 
-    def _prepared(self, index: int) -> _Prepared:
+    def targets(self, index: int) -> Int[Tensor, "p"]:
+        """The numbers of the poses that a source is mapped to; others at each call if resampled."""
+        n_poses = len(self.body(index).poses)
+        poses = torch.randperm(n_poses) if self.resample else torch.arange(n_poses)
+        source = self.source(index)
+        return (poses if source is None else poses[poses != source])[: self.n_targets]
+
+    def __getitem__(self, index: int) -> Batch:
+        body, shape, wks = self._prepared(index)
+        generator = None if self.resample else torch.Generator().manual_seed(index)
+        samples = dp.sample_surface(shape.mesh, self.n_points, generator=generator)
+        points = point_features(shape.mesh, samples, wks).float()
+        targets = self.targets(index)
+        return Batch(shape, points[None], body.posed[targets], body.poses[targets])
+
+    def _prepared(self, index: int) -> _Source:
         if index not in self._kept:
-            body = self.bodies[index]
-            mesh = dp.Mesh(body.rest.double(), body.faces)
+            body = self.bodies[index // max(1, self.sources)]
+            source = self.source(index)
+            vertices = body.rest if source is None else body.posed[source]
+            mesh = dp.Mesh(vertices.double(), body.faces)
             solver, wks = dp.PoissonSolver(mesh), None
             if self.n_energies:
                 wks = dp.wave_kernel_signature(mesh, self.n_energies, solver=solver)
-            shape = Shape.prepare(mesh, wks, solver=solver)
-            self._kept[index] = _Prepared(body, shape, wks)
+            self._kept[index] = _Source(body, Shape.prepare(mesh, wks, solver=solver), wks)
         return self._kept[index]
 
 
-def body_loader(examples: RestToPoses, *, shuffle: bool = False) -> DataLoader[Batch]:
+def body_loader(examples: PoseExamples, *, shuffle: bool = False) -> DataLoader[Batch]:
     """One body a step. Factors live in this process, so there are no workers."""
     return DataLoader(examples, batch_size=None, shuffle=shuffle)
 
@@ -98,7 +114,8 @@ class PoseRecord:
 
     Attributes:
         body: number of the identity in its data set.
-        pose: number of its pose.
+        source: number of the source's pose; None for the rest pose.
+        pose: number of the target's pose.
         l2_v: L2-V.
         l2_j: L2-J of the Jacobians before the Poisson solve, as the paper has it.
         l2_j_emitted: L2-J of those of the emitted map.
@@ -106,6 +123,7 @@ class PoseRecord:
     """
 
     body: int
+    source: int | None
     pose: int
     l2_v: float
     l2_j: float
@@ -115,9 +133,14 @@ class PoseRecord:
 
 @torch.no_grad()
 def evaluate_reposing(
-    model: Model, examples: RestToPoses
+    model: Model, examples: PoseExamples
 ) -> tuple[list[PoseRecord], list[Float[Tensor, "t n 3"]]]:
-    """The maps of each body to its poses: the records, and the maps by body."""
+    """The maps of each source: the records, and the maps by source.
+
+    Args:
+        model: what makes the maps.
+        examples: sources and targets, not resampled.
+    """
     was_training = model.training
     model.eval()
     records: list[PoseRecord] = []
@@ -125,7 +148,12 @@ def evaluate_reposing(
     for index in range(len(examples)):
         batch = examples[index]
         prediction = model(batch.shape, model.encode(batch.points, parameters=batch.parameters))
-        records += _records(examples.body(index).number, batch, prediction)
+        body, source = examples.body(index), examples.source(index)
+        poses = examples.targets(index).tolist()
+        records += [
+            PoseRecord(body.number, source, pose, *errors)
+            for pose, errors in zip(poses, _errors(batch, prediction), strict=True)
+        ]
         maps.append(prediction.vertices)
     model.train(was_training)
     return records, maps
@@ -149,7 +177,8 @@ def summarise(records: Sequence[PoseRecord]) -> dict[str, float]:
     return {name: float(value) for name, value in summary.items()}
 
 
-def _records(number: int, batch: Batch, prediction: Prediction) -> list[PoseRecord]:
+def _errors(batch: Batch, prediction: Prediction) -> list[list[float]]:
+    """The errors of a record, for each map."""
     mesh, phi, target = batch.shape.mesh, prediction.vertices.double(), batch.target.double()
     J = dp.jacobians(mesh, target)
     columns = (
@@ -158,5 +187,4 @@ def _records(number: int, batch: Batch, prediction: Prediction) -> list[PoseReco
         l2_jacobians(dp.jacobians(mesh, phi), J),
         l2_normals(phi, target, mesh.faces),
     )
-    rows = torch.stack(columns, dim=-1).tolist()
-    return [PoseRecord(number, pose, *row) for pose, row in enumerate(rows)]
+    return torch.stack(columns, dim=-1).tolist()

@@ -12,7 +12,7 @@ from njf_models import NeuralJacobianField
 from njf_models.body_report import BodyRow, render_body, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body
 from njf_models.losses import paper_loss
-from njf_models.reposing import RestToPoses, body_loader, evaluate_reposing, summarise
+from njf_models.reposing import PoseExamples, body_loader, evaluate_reposing, summarise
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 from tests import meshes
 
@@ -40,7 +40,7 @@ def bodies():
 
 
 def test_a_batch_is_one_shape_and_targets_with_their_parameters(bodies):
-    batch = RestToPoses(bodies, n_targets=3, n_energies=8, n_points=20)[1]
+    batch = PoseExamples(bodies, n_targets=3, n_energies=8, n_points=20)[1]
     assert batch.n_maps == 3
     assert batch.shape.mesh.n_parts == 1
     assert batch.points.shape == (1, 20, 6 + 8)
@@ -51,8 +51,8 @@ def test_a_batch_is_one_shape_and_targets_with_their_parameters(bodies):
 
 def test_training_sees_all_poses_in_turn_and_evaluation_always_the_same(bodies):
     fixed, fresh = (
-        RestToPoses(bodies, **INPUTS),
-        RestToPoses(bodies, n_targets=2, resample=True, **INPUTS),
+        PoseExamples(bodies, **INPUTS),
+        PoseExamples(bodies, n_targets=2, resample=True, **INPUTS),
     )
     assert_close(fixed[0].points, fixed[0].points)
     assert (fresh[0].points - fresh[0].points).abs().max() > 0
@@ -67,9 +67,24 @@ def test_training_sees_all_poses_in_turn_and_evaluation_always_the_same(bodies):
     assert fresh[0].shape is fresh[0].shape  # factorised once
 
 
+def test_any_pose_can_be_the_source_of_the_others(bodies):
+    examples = PoseExamples(bodies, sources=2, **INPUTS)
+    assert len(examples) == 2 * len(bodies)
+    for index in range(len(examples)):
+        body, source = bodies[index // 2], index % 2
+        batch = examples[index]
+        assert_close(batch.shape.mesh.vertices.float(), body.posed[source])
+        others = [pose for pose in range(5) if pose != source]
+        assert (batch.target == body.posed[others]).all()
+        assert (batch.parameters == body.poses[others]).all()
+    records, maps = evaluate_reposing(NeuralJacobianField(**MODEL), examples)
+    assert [(r.source, r.pose) for r in records[:5]] == [(0, 1), (0, 2), (0, 3), (0, 4), (1, 0)]
+    assert [len(of_source) for of_source in maps] == [4] * 8
+
+
 @pytest.mark.parametrize("kind", ["njf", "displacement", "cages"])
 def test_a_batch_has_the_loss_and_gradient_of_the_mean_over_its_targets(bodies, kind):
-    batch = RestToPoses(bodies, **INPUTS)[0]
+    batch = PoseExamples(bodies, **INPUTS)[0]
     model = NJFTraining(MODEL, kind=kind).model
     torch.nn.init.normal_(model.field.layers[-1].weight, std=0.1)
 
@@ -103,8 +118,8 @@ def test_training_learns_the_twist_and_resumes(bodies, tmp_path, kind):
         trainer = make_trainer(tmp_path, steps=steps, validate_every=30)
         trainer.fit(
             module,
-            body_loader(RestToPoses(train, resample=True, **INPUTS), shuffle=True),
-            body_loader(RestToPoses(validation, **INPUTS)),
+            body_loader(PoseExamples(train, resample=True, **INPUTS), shuffle=True),
+            body_loader(PoseExamples(validation, **INPUTS)),
             ckpt_path=last_checkpoint(tmp_path),
         )
         return trainer
@@ -116,7 +131,7 @@ def test_training_learns_the_twist_and_resumes(bodies, tmp_path, kind):
     assert type(model) is type(NJFTraining(MODEL, kind=kind).model)
     saved = torch.load(path, weights_only=False)
     assert saved["cpu_seconds"] > 0
-    examples = RestToPoses(train, **INPUTS)
+    examples = PoseExamples(train, **INPUTS)
     untrained = summarise(evaluate_reposing(NeuralJacobianField(**MODEL), examples)[0])
     trained = summarise(evaluate_reposing(model, examples)[0])
     for error in ("L2-V", "L2-J", "L2-N, degrees"):
@@ -125,13 +140,14 @@ def test_training_learns_the_twist_and_resumes(bodies, tmp_path, kind):
 
 def test_records_of_a_known_map(bodies):
     """A network that outputs twice a quarter turn: every error can be computed by hand."""
-    examples = RestToPoses(bodies[:2], **INPUTS)
+    examples = PoseExamples(bodies[:2], **INPUTS)
     model = NeuralJacobianField(**MODEL)
     turn = 2 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     with torch.no_grad():
         model.field.layers[-1].bias.copy_((turn - torch.eye(3)).flatten())
     records, maps = evaluate_reposing(model, examples)
     assert [(r.body, r.pose) for r in records] == [(b, p) for b in (0, 1) for p in range(5)]
+    assert {record.source for record in records} == {None}
     record, body = records[7], bodies[1]
     phi, target = (x.double().numpy() for x in (body.rest @ turn.T, body.posed[2]))
     unit = [x - x.mean(0) for x in (phi, target)]

@@ -49,7 +49,7 @@ def test_repose_and_triangulations(tmp_path):
 
     main = runpy.run_path(str(ROOT / "examples" / "triangulations.py"))["main"]
     deviations = main(["--run", str(tmp_path), "--bodies", "1", "--poses", "2"])["ours"]
-    assert deviations["trained on"].deviation == 0
+    assert deviations["trained on"].deviation < 1e-6
     assert deviations["original"].n_faces == 26692
     for name in ("original", "Loop-subdivided", "four times as many"):
         assert 0 < deviations[name].share < 0.2

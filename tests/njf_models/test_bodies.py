@@ -11,6 +11,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from njf_models import NeuralJacobianField
+from njf_models.agnosticism import compare_triangulations
 from njf_models.datasets import bodies
 from njf_models.datasets.bodies import (
     PHENOTYPES,
@@ -25,6 +27,7 @@ from njf_models.datasets.bodies import (
 from njf_models.datasets.poses import JOINTS
 from njf_models.datasets.store import StoreError
 from njf_models.datasets.triangulation import Triangulation
+from njf_models.uv_network import Inputs
 
 pytestmark = pytest.mark.slow  # the body model takes a minute or more to build, the first time
 
@@ -145,6 +148,35 @@ def test_rest_and_poses_are_screened(model, coarse, monkeypatch):
     assert_close(body.rest, rest, rtol=0, atol=1e-6)
     assert_close(body.posed, torch.stack(posed), rtol=0, atol=1e-6)
     assert (seen[0] - seen[1]).abs().max() > 0.01  # another identity
+
+
+def test_maps_on_other_triangulations_are_compared_at_the_same_points(model, coarse):
+    """A network of constant matrices, whose map is the same linear one on every triangulation."""
+    body = draw_body(model, coarse, SETTINGS, 1)
+    network = NeuralJacobianField(6, 6, code_size=8, parameters=POSE_SIZE)
+    matrix = torch.eye(3) + 0.3 * torch.randn(3, 3)
+    with torch.no_grad():
+        network.field.layers[-1].bias.copy_((matrix - torch.eye(3)).flatten())
+    finer = Triangulation.decimated(model.reference, 3000)
+    found = compare_triangulations(
+        network,
+        Inputs(n_points=8, n_energies=0),
+        body_model=model,
+        trained_on=coarse,
+        others={"itself": coarse, "original": Triangulation.original(model.reference), "n": finer},
+        bodies=[body],
+    )
+    assert found["itself"].deviation < 1e-6
+    assert found["original"].deviation < 1e-4  # the points are vertices' convex combinations
+    apart = body.rest @ matrix.T - body.posed
+    apart -= apart.mean(1, keepdim=True)
+    error = float(apart.norm(dim=-1).mean())
+    for deviation in found.values():
+        assert deviation.error == pytest.approx(error, rel=0.02)
+        assert deviation.share == pytest.approx(deviation.deviation / error, rel=1e-3)
+    # Points between the chords of the finer mesh miss the surface a little.
+    assert 1e-5 < found["n"].deviation < 5e-3
+    assert found["n"].n_faces == 3000
 
 
 # -------------------------------------------------------------------- files

@@ -105,7 +105,7 @@ class BodyModel:
         return self._anny(pose_parameters=transforms, phenotype_kwargs=phenotypes)["vertices"]
 
     def intersecting(self, vertices: Float[Tensor, "n 3"]) -> float:
-        """Share of the faces that cut another one, which no bone moves along with them."""
+        """Share of the faces that cut another one; of faces that follow one bone, none counts."""
         return float((self._collisions.detect_self_intersections(vertices) >= 0).float().mean())
 
 
@@ -148,8 +148,8 @@ class BodySettings:
         n_poses: of each identity.
         heading: largest turn about the vertical, in radians; see `poses.sample_pose`.
         max_intersecting: poses in which a larger share of the faces cuts others are drawn again,
-            and so is an identity whose rest pose is one. An arm through the trunk is 0.3% of the
-            faces; of random poses, 88% have none.
+            and so is an identity whose rest pose is one. A limb through the trunk cuts it in rings
+            of few faces.
     """
 
     seed: int = 0

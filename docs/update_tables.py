@@ -246,6 +246,53 @@ def notices() -> str:
     return "\n".join(["| source | licence | meshes, with bent copies |", "|---|---|---|", *rows])
 
 
+def repose() -> str:
+    """Re-posing of unseen bodies, from `examples/repose.py`."""
+    results = json.loads((RESULTS / "repose.json").read_text())
+    summary, options, costs = (results[name] for name in ("summary", "options", "training"))
+    paper = {"ours": 0.84, "displacement": 4.21, "cages": 3.87}  # L2-V from the T-pose
+    theirs = [name for name in summary if name not in ("untrained", "ours")]
+    head = ["untrained: identity", "ours", *theirs, *(f"{name} / ours" for name in theirs)]
+    maps = f"{summary['ours']['maps']:.0f} maps of {options['held_out']} unseen bodies"
+    lines = [f"| {maps} | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
+    for name, ours in summary["ours"].items():
+        if name != "maps":
+            others = [summary[other][name] for other in theirs]
+            cells = [summary["untrained"][name], ours, *others, *(x / ours for x in others)]
+            lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
+    figures = [paper["ours"], *(paper[name] for name in theirs)]
+    figures += [x / paper["ours"] for x in figures[1:]]
+    lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(map(number, figures))} |")
+    spent = "; ".join(
+        f"{name}: {c['steps']:,} steps, {c['cpu seconds'] / 60:.1f} minutes of CPU time"
+        for name, c in costs.items()
+    )
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Trained on {options['bodies']} bodies in {options['poses']} poses each, of "
+            f"{options['faces']:,} faces, {options['targets']} poses a step, code of size "
+            f"{options['code_size']}, one seed. {spent[0].upper()}{spent[1:]}.",
+        ]
+    )
+
+
+def triangulations() -> str:
+    """Maps of the same bodies on several triangulations, from `examples/triangulations.py`."""
+    results = json.loads((RESULTS / "triangulations.json").read_text())
+    ours = results["deviations"].pop("ours")
+    head = ["faces", "error, mm", "deviation, mm", "deviation / own error, %"]
+    head += [f"the same, {name}" for name in results["deviations"]]
+    lines = [f"| triangulation | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
+    for name, row in ours.items():
+        cells = [1000 * row["error"], 1000 * row["deviation"], 100 * row["share"]]
+        cells += [100 * others[name]["share"] for others in results["deviations"].values()]
+        lines.append(f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} |")
+    about = f"{results['bodies']} unseen bodies in {results['poses']} poses each."
+    return "\n".join([*lines, "", about])
+
+
 def data_cost() -> str:
     """Stages and bytes of UV training data, from `tests/benchmarks/data_cost.py`."""
     result = json.loads((RESULTS / "data_cost.json").read_text())
@@ -273,6 +320,8 @@ def data_cost() -> str:
 
 
 TABLES = {
+    "repose": repose,
+    "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,
     "uv_card": uv_card,

@@ -43,10 +43,23 @@ def point_features(
     Returns:
         (s, 6 + k).
     """
+    return samples.interpolate(mesh, vertex_features(mesh, wks))
+
+
+def vertex_features(mesh: dp.Mesh, wks: Float[Tensor, "n k"] | None = None) -> Float[Tensor, "n f"]:
+    """Features of each vertex: position, unit normal, WKS.
+
+    Args:
+        mesh: a mesh in space; positions are taken relative to its bounding box's centre.
+        wks: (n, k) wave-kernel signature of the vertices, or None to do without.
+
+    Returns:
+        (n, 6 + k).
+    """
     columns = [mesh.vertices - bounding_box_centre(mesh), mesh.vertex_normals]
     if wks is not None:
         columns.append(wks.to(mesh.dtype))
-    return samples.interpolate(mesh, torch.cat(columns, dim=1))
+    return torch.cat(columns, dim=1)
 
 
 def bounding_box_centre(mesh: dp.Mesh) -> Float[Tensor, "3"]:
@@ -133,12 +146,14 @@ class Shape:
         features: (m, f) centroid features in the network's dtype.
         frames: (m, 3, 2) the faces' tangent bases in the pose that the features describe; the
             operators are intrinsic and know no pose.
+        vertex_features: (n, f) features of the vertices, for models of maps by their values.
     """
 
     mesh: dp.Mesh
     solver: dp.PoissonSolver
     features: Float[Tensor, "m f"]
     frames: Float[Tensor, "m 3 2"]
+    vertex_features: Float[Tensor, "n f"]
 
     @classmethod
     def prepare(
@@ -148,16 +163,21 @@ class Shape:
         dtype: torch.dtype = torch.float32,
         solver: dp.PoissonSolver | None = None,
     ) -> Shape:
-        """The features of a mesh's faces, and its solver if it is not given."""
+        """The features of a mesh's faces and vertices, and its solver if it is not given."""
         features = face_features(mesh, wks).to(dtype)
-        return cls(mesh, solver or dp.PoissonSolver(mesh), features, mesh.frames.to(dtype))
+        at_vertices = vertex_features(mesh, wks).to(dtype)
+        solver = solver or dp.PoissonSolver(mesh)
+        return cls(mesh, solver, features, mesh.frames.to(dtype), at_vertices)
 
     @classmethod
     def concatenate(cls, shapes: Sequence[Shape]) -> Shape:
         """The disjoint union as one batch, reusing the factors."""
         solver = dp.PoissonSolver.concatenate([shape.solver for shape in shapes])
-        features = torch.cat([shape.features for shape in shapes])
-        return cls(solver.mesh, solver, features, torch.cat([shape.frames for shape in shapes]))
+        features, frames, at_vertices = (
+            torch.cat([getattr(shape, name) for shape in shapes])
+            for name in ("features", "frames", "vertex_features")
+        )
+        return cls(solver.mesh, solver, features, frames, at_vertices)
 
     @cached_property
     def face_weights(self) -> Float[Tensor, "m"]:
@@ -175,10 +195,14 @@ class Shape:
         Nothing intrinsic changes, so operators and factor stay. (A mirrored part counts as
         reoriented too, so that its normals are the mirrored ones.)
         """
-        turns = motions.turns.to(self.features.dtype)[self.mesh.part_of_face]
-        scales = motions.scales.to(self.features.dtype)[self.mesh.part_of_face]
-        features = _moved_features(self.features, turns, scales)
-        return replace(self, features=features, frames=turns @ self.frames)
+        turns, scales = (x.to(self.features.dtype) for x in (motions.turns, motions.scales))
+        parts, owners = self.mesh.part_of_face, self.mesh.part_of_vertex
+        return replace(
+            self,
+            features=_moved_features(self.features, turns[parts], scales[parts]),
+            frames=turns[parts] @ self.frames,
+            vertex_features=_moved_features(self.vertex_features, turns[owners], scales[owners]),
+        )
 
     def with_features(self, features: Float[Tensor, "m f"]) -> Shape:
         """The same operators under other features."""

@@ -64,16 +64,27 @@ class FieldMLP(nn.Module):
         of_code, of_features = weight.split((self.code_size, features.shape[-1]), dim=1)
         per_code = functional.linear(code, of_code, bias)
 
-        def outputs(from_code: Tensor, features: Tensor) -> Tensor:
-            x = _scaled_relu(from_code + functional.linear(features, of_features), norm)
+        def outputs(x: Tensor) -> Tensor:
+            x = _scaled_relu(x, norm)
             for weight, bias, scale in others:
                 x = _scaled_relu(functional.linear(x, weight, bias), scale)
             return self.layers[-1](x)
 
-        if part_of_face is None:
-            return outputs(per_code[..., None, :], features)
-        pieces = [slice(start, start + _ROWS) for start in range(0, len(features), _ROWS)]
-        return torch.cat([outputs(per_code[part_of_face[p]], features[p]) for p in pieces])
+        if part_of_face is not None:
+            pieces = zip(features.split(_ROWS), part_of_face.split(_ROWS), strict=True)
+            return torch.cat(
+                [outputs(per_code[i] + functional.linear(x, of_features)) for x, i in pieces]
+            )
+        per_face = functional.linear(features, of_features)
+        batch, (n_faces, width) = per_code.shape[:-1], per_face.shape[-2:]
+        n_codes = max(1, _ROWS // max(1, n_faces))
+        codes = per_code.reshape(-1, 1, width).split(n_codes)
+        if per_face.ndim == 2:
+            faces = [per_face] * len(codes)
+        else:
+            faces = per_face.expand(*batch, -1, -1).reshape(-1, n_faces, width).split(n_codes)
+        rows = torch.cat([outputs(c + f) for c, f in zip(codes, faces, strict=True)])
+        return rows.unflatten(0, batch) if batch else rows[0]
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:
         """Weight and bias of the hidden layers, so that each group of outputs has mean zero."""

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 import diffpoisson as dp
 from diffpoisson.arguments import require_integer
+from njf_models.encoding import CodedModel
 from njf_models.features import Shape
 from njf_models.field import FieldMLP
-from njf_models.pointnet import PointNet
 
 Centering = Literal["area", "vertex"]
 
@@ -36,7 +36,7 @@ class Prediction(NamedTuple):
     vertices: Float[Tensor, "*batch n c"]
 
 
-class NeuralJacobianField(nn.Module):
+class NeuralJacobianField(CodedModel):
     """The paper's network: PointNet codes, a field of matrices, restriction, Poisson solve.
 
     Args:
@@ -72,51 +72,25 @@ class NeuralJacobianField(nn.Module):
         width: int = 128,
         local_step: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            point_features,
+            encodes_target=encodes_target,
+            code_size=code_size,
+            parameters=parameters,
+        )
         if centering not in ("area", "vertex"):
             raise ValueError(f"centering must be 'area' or 'vertex', got {centering!r}")
         require_integer("NeuralJacobianField", "rounds", rounds, least=1)
         if local_step and output_dim != 2:
             raise ValueError(f"local_step is for maps to the plane, got output_dim={output_dim}")
-        self.encodes_target, self.output_dim, self.centering = encodes_target, output_dim, centering
+        self.output_dim, self.centering = output_dim, centering
         self.rounds, self.shared_rounds, self.local_step = rounds, shared_rounds, local_step
-        self.encoder = PointNet(point_features, code_size) if point_features else None
-        n_codes = (1 + encodes_target) if point_features else 0
-        code_size = n_codes * code_size + parameters
         entries = output_dim * 3
-        self.field = FieldMLP(code_size, face_features, entries, width)
+        self.field = FieldMLP(self.code_size, face_features, entries, width)
         self.corrections = nn.ModuleList(
-            FieldMLP(code_size, face_features + (2 + local_step) * entries, entries, width)
+            FieldMLP(self.code_size, face_features + (2 + local_step) * entries, entries, width)
             for _ in range(min(rounds - 1, 1) if shared_rounds else rounds - 1)
         )
-
-    def encode(
-        self,
-        source: Float[Tensor, "batch s f"] | None = None,
-        target: Float[Tensor, "batch t f"] | None = None,
-        parameters: Float[Tensor, "batch p"] | None = None,
-    ) -> Float[Tensor, "batch z"]:
-        """The global code: PointNet of source and target, and user parameters, side by side.
-
-        Args:
-            source: (batch, s, f) point features of the sources, if the model has an encoder.
-            target: (batch, t, f) point features of the targets, if it encodes them.
-            parameters: (batch, p) user parameters, if it has any.
-        """
-        clouds = [cloud for cloud in (source, target) if cloud is not None]
-        expected = 0 if self.encoder is None else 1 + self.encodes_target
-        if len(clouds) != expected:
-            raise ValueError(
-                f"encode: this model encodes {expected} point cloud(s), got {len(clouds)}"
-            )
-        codes = [self.encoder(cloud) for cloud in clouds] if self.encoder is not None else []
-        code = torch.cat([*codes, *([] if parameters is None else [parameters])], dim=-1)
-        if code.shape[-1] != self.field.code_size:
-            raise ValueError(
-                f"encode: the field expects a code of size {self.field.code_size}, "
-                f"got {code.shape[-1]}; check the number of parameters"
-            )
-        return code
 
     def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
         """The map of a shape for each code; that of the last round.
@@ -152,7 +126,10 @@ class NeuralJacobianField(nn.Module):
 
     def _solved(self, shape: Shape, P: Float[Tensor, "*batch m c 3"]) -> Prediction:
         R = dp.restrict(P, shape.frames)
-        return Prediction(P, R, self._centred(shape, shape.solver(R)))
+        phi = shape.solver(R)
+        if self.centering == "vertex":
+            phi = centre_vertices(shape, phi)
+        return Prediction(P, R, phi)
 
     def _read_back(
         self, shape: Shape, prediction: Prediction
@@ -169,11 +146,6 @@ class NeuralJacobianField(nn.Module):
         features = shape.features.expand(*J.shape[:-2], -1)
         base = seen[-1] if self.local_step else seen[0]
         return base, torch.cat([features, *(matrices.flatten(-2) for matrices in seen)], dim=-1)
-
-    def _centred(
-        self, shape: Shape, phi: Float[Tensor, "*batch n c"]
-    ) -> Float[Tensor, "*batch n c"]:
-        return centre_vertices(shape, phi) if self.centering == "vertex" else phi
 
 
 def centre_vertices(shape: Shape, phi: Float[Tensor, "*batch n c"]) -> Float[Tensor, "*batch n c"]:

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import diffpoisson as dp
+from njf_models.rendering import SAMPLES_PER_PIXEL, splat
 
 SQUARE = 0.06  # side of a checkerboard's square, for patches of unit area
-_SAMPLES_PER_PIXEL = 24  # enough that a sample misses a covered pixel once in e²⁴
 _LIGHT = np.array([0.35, 0.45, 0.82])
 
 
@@ -114,7 +114,7 @@ def render_checkerboard(
         square: side of the checkerboard's squares, in the units of uv.
     """
     samples = dp.sample_surface(
-        mesh, _SAMPLES_PER_PIXEL * size**2, generator=torch.Generator().manual_seed(0)
+        mesh, SAMPLES_PER_PIXEL * size**2, generator=torch.Generator().manual_seed(0)
     )
     points = samples.interpolate(mesh, mesh.vertices @ _view().T)
     texture = samples.interpolate(mesh, uv.double())
@@ -123,7 +123,7 @@ def render_checkerboard(
     colour = np.where(checker[:, None] > 0, (0.98, 0.97, 0.94), (0.16, 0.42, 0.67))
     colour = np.where(normals[:, 2:] < 0, 0.5 * colour + (0.45, 0.2, 0.1), colour)  # back side
     shade = 0.45 + 0.55 * np.abs(normals @ _LIGHT)
-    return _splat(points.numpy(), np.clip(colour * shade[:, None], 0, 1), size)
+    return splat(points.numpy(), np.clip(colour * shade[:, None], 0, 1), size)
 
 
 def _view(elevation: float = 0.9, azimuth: float = -0.5) -> Tensor:
@@ -133,14 +133,3 @@ def _view(elevation: float = 0.9, azimuth: float = -0.5) -> Tensor:
     tilt = np.pi / 2 - elevation
     c, s = np.cos(-tilt), np.sin(-tilt)
     return torch.from_numpy(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ around_z)
-
-
-def _splat(points: np.ndarray, colours: np.ndarray, size: int) -> np.ndarray:
-    """Colour each pixel by the sample nearest to the camera (largest z)."""
-    low, high = points[:, :2].min(0), points[:, :2].max(0)
-    scaled = (points[:, :2] - (low + high) / 2) / (1.05 * (high - low).max()) + 0.5
-    column, row = (scaled * size).astype(int).T
-    nearest_last = np.argsort(points[:, 2])
-    image = np.ones((size, size, 3))
-    image[size - 1 - row[nearest_last], column[nearest_last]] = colours[nearest_last]
-    return image

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -24,6 +24,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
+from njf_models.baselines.cages import CageDeformation
+from njf_models.baselines.displacement import DisplacementField
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
 from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss
@@ -48,17 +50,24 @@ class Example:
 
 @dataclass(frozen=True)
 class Batch:
-    """Examples of different shapes packed into one: their disjoint union, points stacked.
+    """Maps to learn in one step: of several shapes packed into one, or many of one shape.
 
     Attributes:
-        shape: the union of the sources.
-        points: (batch, s, f) point features of each source.
-        target: (n, c) target images of all vertices.
+        shape: the union of the sources, or the one source.
+        points: (sources, s, f) point features of each source.
+        target: (n, c) target images of all vertices, or (t, n, c) of the one source.
+        parameters: (t, p) parameters of each of its targets.
     """
 
     shape: Shape
-    points: Float[Tensor, "batch s f"]
-    target: Float[Tensor, "n c"]
+    points: Float[Tensor, "sources s f"]
+    target: Float[Tensor, "*t n c"]
+    parameters: Float[Tensor, "*t p"] | None = None
+
+    @property
+    def n_maps(self) -> int:
+        """Number of maps."""
+        return len(self.points) if self.target.ndim == 2 else len(self.target)
 
     @classmethod
     def pack(cls, examples: Sequence[Example]) -> Batch:
@@ -172,19 +181,55 @@ class Objective:
         return loss
 
 
+@dataclass
+class _Stopwatch:
+    """Seconds of a clock over several runs.
+
+    Attributes:
+        clock: what tells the time.
+        earlier: seconds of earlier runs; None if they are not known.
+        started: when the present run started, if one is going on.
+    """
+
+    clock: Callable[[], float]
+    earlier: float | None = 0.0
+    started: float | None = None
+
+    @property
+    def seconds(self) -> float | None:
+        if self.earlier is None or self.started is None:
+            return self.earlier
+        return self.earlier + self.clock() - self.started
+
+    def start(self) -> None:
+        self.started = self.clock()
+
+    def stop(self) -> None:
+        self.earlier, self.started = self.seconds, None
+
+
+Model = NeuralJacobianField | DisplacementField | CageDeformation
+MODELS: dict[str, type[Model]] = {
+    "njf": NeuralJacobianField,
+    "displacement": DisplacementField,
+    "cages": CageDeformation,
+}
+
+
 class NJFTraining(lightning.LightningModule):
     """Training with Adam, by the paper's schedule or by a cosine.
 
     Args:
-        model: arguments of `NeuralJacobianField`, kept in the checkpoint.
+        model: arguments of the model, kept in the checkpoint.
         objective: arguments of `Objective`.
         learning_rate: of Adam, at the start.
         patience: validations without improvement before the rate falls to a tenth (the paper).
         steps: let the rate fall to zero along a cosine over so many steps instead.
         inputs: fields of `uv_network.Inputs`, what the network sees, for the record.
+        kind: one of `MODELS`: Neural Jacobian Fields, or a baseline.
 
-    Checkpoints record `training_seconds`, wall time over all runs, validations included; None where
-    an earlier run did not record its own.
+    Checkpoints record `training_seconds` and `cpu_seconds`, over all runs, validations included;
+    None where an earlier run did not record its own.
     """
 
     def __init__(
@@ -196,18 +241,22 @@ class NJFTraining(lightning.LightningModule):
         patience: int = 10,
         steps: int | None = None,
         inputs: dict[str, Any] | None = None,
+        kind: str = "njf",
     ) -> None:
         super().__init__()
         self.objective = Objective(**(objective or {}))
         self.save_hyperparameters()
-        self.model = NeuralJacobianField(**model)
+        if kind not in MODELS:
+            raise ValueError(f"NJFTraining: kind must be one of {sorted(MODELS)}, got {kind!r}")
+        self.model = MODELS[kind](**model)
+        if self.objective.augment and self.model.output_dim != 2:
+            raise ValueError("NJFTraining: augment turns planar maps; set output_dim=2 or leave it")
         self.learning_rate, self.patience, self.steps = learning_rate, patience, steps
-        self._earlier_seconds: float | None = 0.0
-        self._started: float | None = None
+        self._wall, self._cpu = _Stopwatch(time.perf_counter), _Stopwatch(time.process_time)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Loss of one packed batch, averaged over the rounds."""
-        size = len(batch.points)
+        size = batch.n_maps
         if self.objective.augment:
             batch = batch.moved(Motions.random(size))
         losses = [self.objective(batch, prediction).total for prediction in self._iterates(batch)]
@@ -219,7 +268,7 @@ class NJFTraining(lightning.LightningModule):
         """Losses and flips per shape of one packed batch, after the last round."""
         prediction = self._iterates(batch)[-1]
         loss = self.objective(batch, prediction)
-        size = len(batch.points)
+        size = batch.n_maps
         values = {f"validation/{name}": value for name, value in loss._asdict().items()}
         if self.model.output_dim == 2:
             J = dp.jacobians(batch.shape.mesh, prediction.vertices)
@@ -228,30 +277,37 @@ class NJFTraining(lightning.LightningModule):
         self.log_dict(values, batch_size=size, sync_dist=True)
 
     def _iterates(self, batch: Batch) -> list[Prediction]:
-        return self.model.iterates(batch.shape, self.model.encode(batch.points))
+        code = self.model.encode(batch.points, parameters=batch.parameters)
+        return self.model.iterates(batch.shape, code)
 
     @property
     def training_seconds(self) -> float | None:
         """Wall time of training until now, over all runs; None if some did not record theirs."""
-        if self._earlier_seconds is None or self._started is None:
-            return self._earlier_seconds
-        return self._earlier_seconds + time.perf_counter() - self._started
+        return self._wall.seconds
+
+    @property
+    def cpu_seconds(self) -> float | None:
+        """The same of this process's CPU time, which does not depend on what else runs."""
+        return self._cpu.seconds
 
     def on_train_start(self) -> None:
-        """The clock starts."""
-        self._started = time.perf_counter()
+        """The clocks start."""
+        self._wall.start()
+        self._cpu.start()
 
     def on_train_end(self) -> None:
-        """The clock stops."""
-        self._earlier_seconds, self._started = self.training_seconds, None
+        """The clocks stop."""
+        self._wall.stop()
+        self._cpu.stop()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Record the time."""
-        checkpoint["training_seconds"] = self.training_seconds
+        """Record the times."""
+        checkpoint |= {"training_seconds": self._wall.seconds, "cpu_seconds": self._cpu.seconds}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Go on counting."""
-        self._earlier_seconds = checkpoint.get("training_seconds")
+        self._wall.earlier = checkpoint.get("training_seconds")
+        self._cpu.earlier = checkpoint.get("cpu_seconds")
 
     def configure_optimizers(self) -> Any:
         """Adam and the schedule of its rate."""
@@ -342,6 +398,6 @@ def last_checkpoint(folder: Path) -> Path | None:
     return path if path.exists() else None
 
 
-def load_checkpoint(path: Path) -> NeuralJacobianField:
+def load_checkpoint(path: Path) -> Model:
     """The network in a checkpoint of `NJFTraining`, ready for inference."""
     return NJFTraining.load_from_checkpoint(path, map_location="cpu").model.eval()

@@ -40,7 +40,7 @@ class PreparedDisk(NamedTuple):
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a UV network sees of a patch.
+    """What a network sees of a shape.
 
     Attributes:
         n_points: number of surface points for the encoder.

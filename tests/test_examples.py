@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from njf_models.datasets.bodies import BodyStore
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -24,6 +26,33 @@ def test_uv_train(tmp_path, monkeypatch):
     splits = [set(results["splits"][name]) for name in ("train", "validation", "test")]
     assert sum(map(len, splits)) == len(set.union(*splits))  # no mesh on two sides
     assert (tmp_path / "run" / "results.png").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_repose_and_triangulations(tmp_path):
+    """Both models learn, on bodies that are nowhere twice; then their maps on other meshes."""
+    main = runpy.run_path(str(ROOT / "examples" / "repose.py"))["main"]
+    sizes = ["--bodies", "3", "--poses", "4", "--held-out", "2", "--faces", "600"]
+    model = ["--code-size", "16", "--points", "32", "--energies", "0", "--targets", "4"]
+    table = main([*sizes, *model, "--steps", "60", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["summary"] == table
+    assert results["training"]["ours"]["steps"] == 60
+    for name in ("ours", "displacement", "cages"):
+        assert table[name]["maps"] == 2 * 4
+        assert table[name]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
+        assert results["training"][name]["cpu seconds"] > 0
+    kept = {name: BodyStore(tmp_path / "bodies" / name) for name in ("train", "validation", "test")}
+    phenotypes = [tuple(body.phenotype.tolist()) for store in kept.values() for body in store]
+    assert len(set(phenotypes)) == 3 + 2 + 2
+    assert (tmp_path / "results.png").stat().st_size > 50_000
+
+    main = runpy.run_path(str(ROOT / "examples" / "triangulations.py"))["main"]
+    deviations = main(["--run", str(tmp_path), "--bodies", "1", "--poses", "2"])["ours"]
+    assert deviations["trained on"].deviation < 1e-6
+    assert deviations["original"].n_faces == 26692
+    for name in ("original", "Loop-subdivided", "four times as many"):
+        assert 0 < deviations[name].share < 0.2
 
 
 def test_fit_source(tmp_path):

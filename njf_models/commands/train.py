@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 from njf_models.commands import UsageError
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from njf_models.datasets.store import UVStore
-    from njf_models.njf import NeuralJacobianField
 
 _EXAMPLE = """\
 examples:
@@ -111,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _begin_with(model: NeuralJacobianField, arguments: dict[str, Any], weights: str) -> None:
+def _begin_with(model: nn.Module, arguments: dict[str, Any], weights: str) -> None:
     """Load weights that are known by name or in a file."""
     from njf_models.pretrained import load_pretrained  # noqa: PLC0415
     from njf_models.uv_network import UVNetwork  # noqa: PLC0415

@@ -63,6 +63,22 @@ def test_split_first_layer_is_the_plain_network_on_code_and_features():
     assert_close(model(features, codes), expected, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("m", [30, 700, 3000])
+@pytest.mark.parametrize("batch", [(), (0,), (7,), (2, 3)])
+@pytest.mark.parametrize("own_features", [False, True])
+def test_codes_of_one_shape_are_applied_one_by_one(m, batch, own_features):
+    """As many as fit at a time; on the shape's features, or on each its own."""
+    model = randomised(FieldMLP(20, 6, width=32))
+    codes = torch.randn(*batch, 20, dtype=torch.float64)
+    features = torch.randn(*(batch if own_features else ()), m, 6, dtype=torch.float64)
+    out = model(features, codes)
+    assert out.shape == (*batch, m, 9)
+    each = features.expand(*batch, m, 6).reshape(-1, m, 6)
+    for got, code, seen in zip(out.reshape(-1, m, 9), codes.reshape(-1, 20), each, strict=True):
+        expected = model.layers(torch.cat([code.expand(m, 20), seen], dim=1))
+        assert_close(got, expected, rtol=1e-10, atol=1e-10)
+
+
 @pytest.mark.parametrize("m", [30, 2048, 5000])
 def test_packed_faces_get_the_code_of_their_part(m):
     model = randomised(FieldMLP(20, 6))

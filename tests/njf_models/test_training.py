@@ -182,14 +182,18 @@ def test_a_moved_batch_is_that_of_moved_meshes(patches):
     features = moved.shape.mesh.split_faces(moved.shape.features)
     frames = moved.shape.mesh.split_faces(moved.shape.frames)
     targets = moved.shape.mesh.split_vertices(moved.target)
+    at_vertices = moved.shape.mesh.split_vertices(moved.shape.vertex_features)
     for k, patch in enumerate(patches[:3]):
         turn, scale = motions.turns[k].double(), motions.scales[k].double()
         faces = patch.mesh.faces.flip(1) if mirrored[k] else patch.mesh.faces
         mesh = dp.Mesh(scale * patch.mesh.vertices @ turn.T, faces)
-        expected = Shape.prepare(mesh).features
+        built = Shape.prepare(mesh)
+        expected = built.features
         offset = expected[:, :3] - features[k][:, :3]  # another bounding box, another centre
         assert_close(offset, offset[:1].expand_as(offset), rtol=1e-4, atol=1e-5)
         assert_close(features[k][:, 3:], expected[:, 3:], rtol=1e-4, atol=1e-5)
+        shifted = torch.cat([at_vertices[k][:, :3] + offset[:1], at_vertices[k][:, 3:]], dim=1)
+        assert_close(shifted, built.vertex_features, rtol=1e-4, atol=1e-5)
         # A matrix for the moved shape acts on its tangents as its counterpart did before.
         P = torch.randn(2, 3)
         before = P @ examples[k].shape.frames

@@ -125,6 +125,7 @@ class NeuralJacobianField(CodedModel):
         return outputs.unflatten(-1, (self.output_dim, 3))
 
     def _solved(self, shape: Shape, P: Float[Tensor, "*batch m c 3"]) -> Prediction:
+        P = P.to(shape.frames.dtype)  # under autocast the field answers in half precision
         R = dp.restrict(P, shape.frames)
         phi = shape.solver(R)
         if self.centering == "vertex":

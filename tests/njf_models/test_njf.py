@@ -129,6 +129,23 @@ def test_rounds_read_the_map_back_and_correct_it(shared, local_step):
             features = torch.cat([features, P.flatten(1)], dim=1)
 
 
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_under_autocast_only_the_networks_are_rounded(rounds):
+    torch.manual_seed(0)
+    shape = Shape.prepare(bumpy_disk(0))
+    model = NeuralJacobianField(6, 6, code_size=16, output_dim=2, rounds=rounds)
+    randomised(model)
+    model.float()
+    code = model.encode(torch.randn(1, 50, 6))
+    exact = model(shape, code)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        prediction = model(shape, code)
+    assert all(field.dtype == torch.float32 for field in prediction)
+    assert torch.equal(prediction.vertices, shape.solver(prediction.jacobians))
+    error = (prediction.vertices - exact.vertices).abs().max() / exact.vertices.abs().max()
+    assert 0 < error < 0.1
+
+
 def test_the_local_step_is_for_maps_to_the_plane():
     with pytest.raises(ValueError, match="maps to the plane, got output_dim=3"):
         NeuralJacobianField(6, 6, rounds=2, local_step=True)

@@ -83,7 +83,12 @@ class FieldMLP(nn.Module):
             faces = [per_face] * len(codes)
         else:
             faces = per_face.expand(*batch, -1, -1).reshape(-1, n_faces, width).split(n_codes)
-        rows = torch.cat([outputs(c + f) for c, f in zip(codes, faces, strict=True)])
+        rows = torch.cat(
+            [
+                torch.cat([outputs(c + piece) for piece in f.split(_ROWS, dim=-2)], dim=-2)
+                for c, f in zip(codes, faces, strict=True)
+            ]
+        )
         return rows.unflatten(0, batch) if batch else rows[0]
 
     def _centred_layers(self) -> Iterator[tuple[Tensor, Tensor, nn.GroupNorm]]:

@@ -145,13 +145,16 @@ def training(quick: bool) -> Iterator[Figure]:
     images = torch.randn(targets, shape.mesh.n_vertices, 3)
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0)  # the weights stay
 
-    def step(predict: Callable[[Tensor], Prediction]) -> None:
+    def step(predict: Callable[[], Prediction]) -> None:
         optimizer.zero_grad()
-        code = model.encode(clouds[:1].expand(targets, -1, -1), clouds[1:])
-        paper_loss(shape, predict(code), images).total.backward()
+        paper_loss(shape, predict(), images).total.backward()
         optimizer.step()
 
-    works = {"ours": lambda: step(lambda z: model(shape, z)), "plain": lambda: step(plain)}
+    sources = clouds[:1].expand(targets, -1, -1)  # one for each target, where ours takes one alone
+    works = {
+        "ours": lambda: step(lambda: model(shape, model.encode(clouds[:1], clouds[1:]))),
+        "plain": lambda: step(lambda: plain(model.encode(sources, clouds[1:]))),
+    }
     gradients = []
     for work in works.values():
         work()

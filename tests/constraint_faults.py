@@ -456,7 +456,4 @@ def unsigned_singular_values(patch):
 def planar_cofactors(patch):
     """‖cof J‖ = ‖J‖, which holds for surfaces only."""
 
-    def planar(original, J, chi):
-        return distortion._squared_norm(J / chi[..., None, None])
-
-    wrap(patch, distortion, "_squared_inverse", planar)
+    wrap(patch, distortion, "_squared_inverse", lambda f, J, chi, norm: norm / chi / chi)

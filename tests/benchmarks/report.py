@@ -138,6 +138,10 @@ def plot_ratios(figures: list[Figure], path: Path) -> Path:
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set(xscale="log", xlabel="measured over target (right of 1: better than asked)")
     axes.set_yticks(rows, names, fontsize=7)
+    axes.set_ylim(-1, len(figures))
+    ticks = (0.2, 0.5, 1, 2, 5)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
     axes.grid(axis="x", alpha=0.3)
     return _saved(picture, path)
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from diffpoisson.linear_map import Matrix
 
-# Of one call: cholespy's limit on CUDA; CHOLMOD solves four columns at a time, and is slower, never
-# faster, with the many of which the work space outgrows the cache.
+# Of one call: cholespy's limit on CUDA. CHOLMOD solves four columns at a time whatever it is given;
+# beyond a few times four, their work space only takes the cache from the factor.
 _COLUMNS = {"cuda": 128, "cpu": 8}
 
 

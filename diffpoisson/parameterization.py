@@ -184,7 +184,7 @@ def _slim_iterates(
     arguments, scale = _libigl_arguments(mesh, points)
     data = igl.slim_precompute(*arguments)
     while True:
-        yield scale * np.ascontiguousarray(igl.slim_solve(data, 1)[:, :2])
+        yield scale * np.ascontiguousarray(igl.slim_solve(data, 1))
 
 
 def _scaffold_iterates(
@@ -198,8 +198,7 @@ def _scaffold_iterates(
     data = triangle.SCAFData()
     triangle.scaf_precompute(*arguments, data)
     while True:
-        moved = triangle.scaf_solve(1, data)[: mesh.n_vertices, :2]
-        yield scale * np.ascontiguousarray(moved)
+        yield scale * np.ascontiguousarray(triangle.scaf_solve(1, data))
 
 
 def _libigl_arguments(mesh: Mesh, points: np.ndarray) -> tuple[tuple[Any, ...], float]:

@@ -65,7 +65,7 @@ def laplacian_eigenpairs(
             f"laplacian_eigenpairs: a mesh of {n} vertices has {n} eigenpairs, not {n_eigenpairs}"
         )
     _check_solver(mesh, solver, intrinsic_delaunay)
-    areas = lumped_mass(mesh, mass).double().cpu().numpy()
+    areas = _lumped_mass("laplacian_eigenpairs", mesh, mass).cpu().numpy()
     # Of total one, so that no scale is too large or small for ARPACK's tolerances.
     total = areas.sum()
     areas = areas / total
@@ -91,14 +91,19 @@ def lumped_mass(mesh: Mesh, mass: Mass = "barycentric") -> Float[Tensor, "n"]:
         MeshError: Voronoi areas of tetrahedra.
     """
     require_mesh("lumped_mass", mesh)
+    return _lumped_mass("lumped_mass", mesh, mass).to(mesh.dtype)
+
+
+def _lumped_mass(operation: str, mesh: Mesh, mass: Mass) -> Float[Tensor, "n"]:
+    """The same in float64, whatever the mesh's dtype."""
     if str(mass) not in get_args(Mass):
-        raise ValueError(f"lumped_mass: mass must be 'barycentric' or 'voronoi', got {mass!r}")
+        raise ValueError(f"{operation}: mass must be 'barycentric' or 'voronoi', got {mass!r}")
     if mass == "barycentric":
-        return mesh.vertex_measures
-    mesh._require_triangles("lumped_mass: Voronoi areas")
+        return mesh._double_vertex_measures
+    mesh._require_triangles(f"{operation}: Voronoi areas")
     shares = mesh._double_measures[:, None] * _voronoi_shares(mesh._corners)
-    total = torch.zeros(mesh.n_vertices, dtype=torch.float64, device=mesh.device)
-    return total.index_add(0, mesh.faces.flatten(), shares.flatten()).to(mesh.dtype)
+    total = shares.new_zeros(mesh.n_vertices)
+    return total.index_add(0, mesh.faces.flatten(), shares.flatten())
 
 
 def wave_kernel_signature(

@@ -160,6 +160,21 @@ def test_refinements():
         solver(R, **images, refinements=-1)
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_one_refinement_mends_any_error(held):
+    """Newton's method for a linear system: also of a map that is nowhere near."""
+    mesh = dp.Mesh(*meshes.disk())
+    kinds = {"pins": torch.tensor([0]), "handles": torch.tensor([3, 9])} if held else {}
+    solver = dp.PoissonSolver(mesh, **kinds)
+    images = {name: torch.randn(len(at), 3).double() for name, at in kinds.items()}
+    R = torch.randn(mesh.n_faces, 3, 2, dtype=torch.float64)
+    expected = solver(R, **images)
+    noise = torch.randn_like(expected)
+    noise = noise - (noise[0] if held else mesh.vertex_areas @ noise / mesh.vertex_areas.sum())
+    pull = solver.constraints.handle_weights[:, None] * images["handles"] if held else None
+    torch.testing.assert_close(solver._refined(expected + noise, R, pull), expected)
+
+
 @pytest.mark.parametrize("name", ["needles", "caps", "one_sliver"])
 def test_refinements_restore_digits(name):
     """On faces of aspect ratio 10,000, against sixty-digit arithmetic."""

@@ -200,6 +200,12 @@ def test_invariance_to_rotations(name, drawn, left, right):
     assert (equal | ((turned - expected).abs() <= 1e-13 * condition**2 * scale)).all()
 
 
+def test_arap_keeps_its_digits_beside_a_reflection():
+    """σ₁ + σ₂ = 1e-9 there, of which the root of a difference of squares would leave nothing."""
+    J = torch.diag(torch.tensor([1, 1e-9 - 1], dtype=torch.float64))
+    assert_near(dp.arap(J), torch.tensor((2 - 1e-9) ** 2, dtype=torch.float64), 1e-15)
+
+
 def test_arap_is_the_distance_to_the_nearest_rotation():
     """In the plane: proper rotations only, so that flips cost; in space: isometric embeddings."""
     for c in (2, 3):

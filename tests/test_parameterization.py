@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import islice
 
 import igl
 import numpy as np
@@ -8,9 +9,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from igl import triangle
 
 import diffpoisson as dp
-from diffpoisson.parameterization import _Descent, procrustes, slim, tutte
+from diffpoisson.parameterization import (
+    _Descent,
+    _rounded,
+    _scaffold_iterates,
+    _slim_iterates,
+    procrustes,
+    slim,
+    tutte,
+)
 from tests import meshes, references
 
 
@@ -81,6 +91,24 @@ def test_tutte_of_a_disk_without_interior_vertices() -> None:
     assert not dp.flipped(dp.jacobians(mesh, tutte(mesh))).any()
 
 
+def test_tutte_of_a_long_tube_exceeds_single_precision() -> None:
+    """Each ring shrinks by a factor, around a point that is not the origin: uneven corners."""
+    around, along = 6, 30
+    angle, height = np.meshgrid(2 * np.pi * (np.arange(around) / around) ** 1.5, np.arange(along))
+    tube = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).reshape(-1, 3)
+    ring = np.arange(around)
+    a = (around * np.arange(along - 1)[:, None] + ring).ravel()
+    b = (around * np.arange(along - 1)[:, None] + np.roll(ring, -1)).ravel()
+    tip, last = len(tube), around * (along - 1)
+    fan = np.c_[last + ring, last + np.roll(ring, -1), np.full(around, tip)]
+    faces = np.r_[np.c_[a, b, b + around], np.c_[a, b + around, a + around], fan]
+    vertices = np.r_[tube, [[0, 0, along]]]
+    mesh = dp.Mesh(vertices, faces)
+    assert not dp.flipped(dp.jacobians(mesh, tutte(mesh))).any()
+    with pytest.raises(dp.MeshError, match=r"rounding to torch.float32 flips \d+ of"):
+        tutte(dp.Mesh(vertices.astype(np.float32), faces))
+
+
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
@@ -138,6 +166,44 @@ def test_slim_unrolls_a_developable_surface_isometrically() -> None:
     edges = igl.edges(faces)
     lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (uv, vertices)]
     np.testing.assert_allclose(*lengths, rtol=2e-3)
+
+
+@pytest.mark.parametrize("scaffold", [False, True])
+def test_iterates_are_those_of_libigl(scaffold: bool) -> None:
+    """One iteration each, with a scaffold or without, in the mesh's unit."""
+    vertices, faces = meshes.disk(2, 6)
+    vertices *= 7
+    mesh = dp.Mesh(vertices, faces)
+    start, unit = tutte(mesh).numpy(), np.sqrt(references.areas(vertices, faces).sum())
+    arguments = (
+        np.asfortranarray(vertices / unit),
+        np.asfortranarray(faces, dtype=np.int32),
+        np.asfortranarray(start / unit),
+        igl.MappingEnergyType.SYMMETRIC_DIRICHLET,
+        np.zeros(0, dtype=np.int32),
+        np.zeros((0, 2), order="F"),
+        0.0,
+    )
+    if scaffold:
+        data = triangle.SCAFData()
+        triangle.scaf_precompute(*arguments, data)
+        expected = [triangle.scaf_solve(1, data)[: len(vertices)].copy() for _ in range(3)]
+    else:
+        data = igl.slim_precompute(*arguments)
+        expected = [igl.slim_solve(data, 1)[:, :2].copy() for _ in range(3)]
+    iterates = (_scaffold_iterates if scaffold else _slim_iterates)(mesh, start)
+    for uv, reference in zip(islice(iterates, 3), expected, strict=True):
+        np.testing.assert_allclose(uv, unit * reference, atol=1e-6)
+
+
+def test_slim_does_not_round_to_a_precision_that_flips_faces() -> None:
+    """Far from the origin, single precision leaves no difference between two corners."""
+    vertices, faces = meshes.disk(0, 6)
+    mesh = dp.Mesh(vertices.astype(np.float32), faces)
+    near = tutte(mesh).double().numpy()
+    assert torch.equal(_rounded(mesh, near), tutte(mesh))
+    with pytest.raises(dp.MeshError, match=r"rounding to torch.float32 flips \d+ of"):
+        _rounded(mesh, near + 1e9)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e3])

@@ -303,3 +303,19 @@ def test_a_factor_without_digits_raises(monkeypatch):
         with pytest.raises(dp.MeshError, match="leaves no digit"):
             solver(factor, **options)
     solver(1.99)
+
+
+def test_digits_are_required_of_each_held_component(monkeypatch):
+    """A large component in place does not make up for a small one that is lost."""
+    large = dp.Mesh(10 * meshes.disk()[0], meshes.disk()[1])
+    mesh = dp.Mesh.concatenate([large, dp.Mesh(*meshes.disk())])
+    pins = torch.tensor([0, large.n_vertices])
+    exact = poisson.PoissonSolver._fitted
+
+    def lost(self, *arguments):
+        return exact(self, *arguments).index_fill(0, torch.arange(40, mesh.n_vertices), 0)
+
+    dp.PoissonSolver(mesh, pins=pins)
+    monkeypatch.setattr(poisson.PoissonSolver, "_fitted", lost)
+    with pytest.raises(dp.MeshError, match="leaves no digit"):
+        dp.PoissonSolver(mesh, pins=pins)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import igl
@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 from jaxtyping import Float
+from scipy.sparse import csgraph
 from torch import Tensor
 
 from diffpoisson import topology
@@ -37,6 +38,8 @@ from diffpoisson.factor import CholeskyFactor
 from diffpoisson.gradient import gradient_operator, jacobians, laplacian
 from diffpoisson.mesh import Mesh, MeshError, require_mesh
 from diffpoisson.transforms import is_constant
+
+_PULLS = (1.0, 2.0, 4.0, 8.0, 16.0)  # see `_embeddings`
 
 
 class SlimResult(NamedTuple):
@@ -59,7 +62,8 @@ def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
     """A flip-free map of a disk onto a round disk of the same area.
 
     The cotangent-harmonic map where it has no flips, else the uniform one, which in exact
-    arithmetic cannot have any.
+    arithmetic cannot have any. Where the surface is so deep that rounding flips what shrank at its
+    bottom, weights that pull outward, twice, four times … as strongly with each edge of depth.
 
     Args:
         mesh: a topological disk in space.
@@ -77,16 +81,16 @@ def tutte(mesh: Mesh) -> Float[Tensor, "n 2"]:
         surface triangulations", 1997.
     """
     require_disk("tutte", mesh)
-    uv = harmonic_disk(mesh)
-    if flipped(jacobians(mesh, uv)).any():
-        uv = _extended_from_circle(mesh, _graph_laplacian(mesh))
+    fewest = mesh.n_faces
+    for uv in chain([harmonic_disk(mesh)], _embeddings(mesh)):
         n_flipped = int(flipped(jacobians(mesh, uv)).sum())
-        if n_flipped:
-            raise MeshError(
-                f"tutte: rounding to {mesh.dtype} flips {n_flipped} of {mesh.n_faces} faces, which "
-                "shrank too far; use float64, or cut the surface into flatter pieces"
-            )
-    return uv
+        if n_flipped == 0:
+            return uv
+        fewest = min(fewest, n_flipped)
+    raise MeshError(
+        f"tutte: rounding to {mesh.dtype} flips {fewest} of {mesh.n_faces} faces, which shrank too "
+        "far; use float64, or cut the surface into flatter pieces"
+    )
 
 
 def harmonic_disk(mesh: Mesh) -> Float[Tensor, "n 2"]:
@@ -285,16 +289,27 @@ def _extended_from_circle(mesh: Mesh, L: sp.csr_matrix) -> Float[Tensor, "n 2"]:
     return u.to(mesh.vertices)
 
 
-def _graph_laplacian(mesh: Mesh) -> sp.csr_matrix:
-    """D - A of the mesh's graph: Tutte's uniform weights.
+def _embeddings(mesh: Mesh) -> Iterator[Float[Tensor, "n 2"]]:
+    """Each interior vertex at a mean of its neighbours: an embedding, whatever the weights.
 
-    Only right at interior vertices, whose edges are all half-edges of two faces, one each way.
+    (Floater 1997.) Those here are pull^-(dᵢ + dⱼ), d the number of edges to the boundary: to vertex
+    i, a neighbour counts pull times as much as one that is an edge deeper, and the matrix stays
+    symmetric. Uniform weights, of pull 1, come first.
     """
     half_edges = topology.half_edges(mesh.faces.cpu().numpy())
     i, j = np.concatenate([half_edges, half_edges[:, ::-1]]).T
     n = mesh.n_vertices
-    adjacency = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
-    return (sp.diags(np.bincount(i, minlength=n).astype(np.float64)) - adjacency).tocsr()
+    graph = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    boundary = mesh.boundary_loops[0].cpu().numpy()
+    depths = csgraph.dijkstra(graph, indices=boundary, unweighted=True, min_only=True)
+    sums = depths[i] + depths[j]
+    for pull in _PULLS:
+        if sums.max() * math.log2(pull) < 1000:  # the exponents of double precision end at -1022
+            # Only right at interior vertices, whose edges have two faces, one half-edge each way.
+            weights = pull**-sums
+            adjacency = sp.coo_matrix((weights, (i, j)), shape=(n, n)).tocsr()
+            degrees = sp.diags(np.bincount(i, weights, minlength=n))
+            yield _extended_from_circle(mesh, (degrees - adjacency).tocsr())
 
 
 def _mean_energy(mesh: Mesh) -> Callable[[Float[np.ndarray, "n 2"]], float]:

@@ -13,7 +13,9 @@ from igl import triangle
 
 import diffpoisson as dp
 from diffpoisson.parameterization import (
+    _PULLS,
     _Descent,
+    _embeddings,
     _rounded,
     _scaffold_iterates,
     _slim_iterates,
@@ -91,22 +93,51 @@ def test_tutte_of_a_disk_without_interior_vertices() -> None:
     assert not dp.flipped(dp.jacobians(mesh, tutte(mesh))).any()
 
 
-def test_tutte_of_a_long_tube_exceeds_single_precision() -> None:
-    """Each ring shrinks by a factor, around a point that is not the origin: uneven corners."""
-    around, along = 6, 30
+def tube(around: int, along: int) -> meshes.Arrays:
+    """A tube closed at one end; corners of uneven distances, so that its tip maps to no origin."""
     angle, height = np.meshgrid(2 * np.pi * (np.arange(around) / around) ** 1.5, np.arange(along))
-    tube = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).reshape(-1, 3)
+    rings = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).reshape(-1, 3)
     ring = np.arange(around)
     a = (around * np.arange(along - 1)[:, None] + ring).ravel()
     b = (around * np.arange(along - 1)[:, None] + np.roll(ring, -1)).ravel()
-    tip, last = len(tube), around * (along - 1)
-    fan = np.c_[last + ring, last + np.roll(ring, -1), np.full(around, tip)]
+    last = around * (along - 1)
+    fan = np.c_[last + ring, last + np.roll(ring, -1), np.full(around, len(rings))]
     faces = np.r_[np.c_[a, b, b + around], np.c_[a, b + around, a + around], fan]
-    vertices = np.r_[tube, [[0, 0, along]]]
+    return np.r_[rings, [[0, 0, along]]], faces
+
+
+@pytest.mark.parametrize(("dtype", "along"), [(np.float32, 30), (np.float64, 60)])
+def test_tutte_of_a_deep_tube_pulls_outward(dtype: type, along: int) -> None:
+    """Each ring shrinks by a factor, beyond what rounding leaves of uniform weights."""
+    vertices, faces = tube(6, along)
+    mesh = dp.Mesh(vertices.astype(dtype), faces)
+    for uv, holds in ((next(_embeddings(mesh)), False), (tutte(mesh), True)):
+        a, b, c = uv.double().numpy()[faces].swapaxes(0, 1)
+        assert bool((np.linalg.det(np.stack([b - a, c - a], axis=1)) > 0).all()) is holds
+
+
+def test_embeddings_are_weighted_means() -> None:
+    """By the definition, one vertex at a time."""
+    vertices, faces = meshes.disk(3, 7)
     mesh = dp.Mesh(vertices, faces)
-    assert not dp.flipped(dp.jacobians(mesh, tutte(mesh))).any()
-    with pytest.raises(dp.MeshError, match=r"rounding to torch.float32 flips \d+ of"):
-        tutte(dp.Mesh(vertices.astype(np.float32), faces))
+    neighbours = {v: np.setdiff1d(faces[(faces == v).any(1)], v) for v in range(len(vertices))}
+    loop = np.asarray(igl.boundary_loop(faces))
+    depth = np.where(np.isin(np.arange(len(vertices)), loop), 0, len(vertices))
+    for _ in depth:
+        depth = np.array([min(depth[v], 1 + depth[neighbours[v]].min()) for v in neighbours])
+    for pull, uv in zip(_PULLS, _embeddings(mesh), strict=True):
+        for v in np.flatnonzero(depth):
+            weights = pull ** -depth[neighbours[v]].astype(float)
+            mean = np.average(uv[neighbours[v]], axis=0, weights=weights)
+            np.testing.assert_allclose(uv[v], mean, atol=1e-12)
+
+
+def test_tutte_gives_up_where_nothing_is_left() -> None:
+    """Three corners around, two hundred rings: no weights that double precision can hold help."""
+    mesh = dp.Mesh(*tube(3, 200))
+    assert len(list(_embeddings(mesh))) == 3
+    with pytest.raises(dp.MeshError, match=r"rounding to torch.float64 flips \d+ of"):
+        tutte(mesh)
 
 
 @pytest.mark.parametrize(

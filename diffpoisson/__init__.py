@@ -22,6 +22,7 @@ from diffpoisson.parameterization import SlimResult, procrustes, slim, tutte
 from diffpoisson.poisson import PoissonSolver, solve_poisson
 from diffpoisson.repair import clamp_flips, clamp_singular_values, untangle
 from diffpoisson.restriction import extend, restrict
+from diffpoisson.rigid import RigidMap, as_rigid_as_possible
 from diffpoisson.sampling import SurfaceSamples, sample_surface
 from diffpoisson.spectral import (
     heat_kernel_signature,
@@ -38,11 +39,13 @@ __all__ = [
     "Mesh",
     "MeshError",
     "PoissonSolver",
+    "RigidMap",
     "SlimResult",
     "SurfaceSamples",
     "UVMap",
     "arap",
     "area_distortion",
+    "as_rigid_as_possible",
     "certify",
     "clamp_flips",
     "clamp_singular_values",

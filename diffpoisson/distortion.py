@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from diffpoisson.arguments import require_number, require_single_or_double, require_tensor
+from diffpoisson.rotations import nearest_rotation
 
 Jacobian = Float[Tensor, "*batch c d"]
 Density = Float[Tensor, "*batch"]
@@ -50,17 +51,23 @@ def singular_values(J: Jacobian) -> Float[Tensor, "*batch d"]:
     return torch.stack([total + difference, total - difference], dim=-1) / 2
 
 
-def closest_rotation(J: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
-    """The rotation Q that minimises ‖J - Q‖: the local step of Liu et al. 2008, in the plane.
+def closest_rotation(J: Jacobian) -> Jacobian:
+    """The rotation Q that minimises ‖J - Q‖: the local step of Liu et al. 2008.
 
-    That of the similarity part of J. Where it vanishes, as it does for a reflection, all rotations
-    are equally close: Q is then the identity, with derivative zero.
+    Of a surface in space, (3, 2): the matrix of orthonormal columns that is closest. Where several
+    are closest, the derivative is zero, and Q one of them: in the plane, where the similarity part
+    of J vanishes, as it does for a reflection, the identity. In space, derivatives are exact up to
+    third order.
 
     Raises:
-        ValueError: J is not (…, 2, 2).
+        ValueError: J is not (…, 2, 2), (…, 3, 2) or (…, 3, 3).
     """
     if _shape(J) != (2, 2):
-        raise ValueError(f"closest_rotation: expected J of shape (…, 2, 2), got {tuple(J.shape)}")
+        require_single_or_double("closest_rotation", "J", J)
+        if J.shape[-1] == 3:
+            return nearest_rotation(J)
+        # With a third column of zeros. The third of Q is then the normal.
+        return nearest_rotation(torch.cat([J, torch.zeros_like(J[..., :1])], dim=-1))[..., :2]
     similarity, _ = similarity_parts(J)
     length = torch.linalg.vector_norm(similarity, dim=-1, keepdim=True)
     unit = similarity / torch.where(length > 0, length, 1)

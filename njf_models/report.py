@@ -103,7 +103,11 @@ def draw_curve(ax: Axes, log: Path) -> None:
 
 
 def render_checkerboard(
-    mesh: dp.Mesh, uv: Float[Tensor, "n 2"], size: int = 320, square: float = SQUARE
+    mesh: dp.Mesh,
+    uv: Float[Tensor, "n 2"],
+    size: int = 320,
+    square: float = SQUARE,
+    seen: Float[Tensor, "k 3"] | None = None,
 ) -> Float[np.ndarray, "size size 3"]:
     """An orthographic picture of a mesh in space, by splatting random surface samples.
 
@@ -112,18 +116,24 @@ def render_checkerboard(
         uv: (n, 2) texture coordinates, in the mesh's units.
         size: pixels of each side.
         square: side of the checkerboard's squares, in the units of uv.
+        seen: points that the picture has room for; by default those of the surface.
     """
+    view, window = _view(), None
+    if seen is not None:
+        at = (seen.double() @ view.T)[:, :2]
+        low, high = at.amin(0), at.amax(0)
+        window = ((low + high) / 2).numpy(), 1.05 * float((high - low).max())
     samples = dp.sample_surface(
         mesh, SAMPLES_PER_PIXEL * size**2, generator=torch.Generator().manual_seed(0)
     )
-    points = samples.interpolate(mesh, mesh.vertices @ _view().T)
+    points = samples.interpolate(mesh, mesh.vertices @ view.T)
     texture = samples.interpolate(mesh, uv.double())
-    normals = (mesh.normals @ _view().T)[samples.faces].numpy()
+    normals = (mesh.normals @ view.T)[samples.faces].numpy()
     checker = (texture / square).floor().sum(dim=1).remainder(2).numpy()
     colour = np.where(checker[:, None] > 0, (0.98, 0.97, 0.94), (0.16, 0.42, 0.67))
     colour = np.where(normals[:, 2:] < 0, 0.5 * colour + (0.45, 0.2, 0.1), colour)  # back side
     shade = 0.45 + 0.55 * np.abs(normals @ _LIGHT)
-    return splat(points.numpy(), np.clip(colour * shade[:, None], 0, 1), size)
+    return splat(points.numpy(), np.clip(colour * shade[:, None], 0, 1), size, window)
 
 
 def _view(elevation: float = 0.9, azimuth: float = -0.5) -> Tensor:

@@ -8,8 +8,11 @@ import runpy
 from pathlib import Path
 
 import pytest
+import torch
+import trimesh
 
 from njf_models.datasets.bodies import BodyStore
+from tests import meshes
 
 ROOT = Path(__file__).parent.parent
 
@@ -64,6 +67,23 @@ def test_fit_source(tmp_path):
     assert after < 1e-6 * before
     assert (tmp_path / "source.png").stat().st_size > 50_000
     assert (tmp_path / "source.obj").stat().st_size > 1_000
+
+
+def test_unroll(tmp_path):
+    """From a ball, cut open, to its map in the plane."""
+    vertices, faces = meshes.sphere(subdivisions=2)
+    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "ball.ply")
+    main = runpy.run_path(str(ROOT / "examples" / "unroll.py"))["main"]
+    options = ["--mesh", str(tmp_path / "ball.ply"), "--frames", "5", "--size", "60"]
+    shapes = main([*options, "--out", str(tmp_path)])
+    surface, *between, flat = shapes
+    assert len(surface) > len(vertices)  # seams split them
+    width = float(torch.pdist(torch.from_numpy(vertices)).max())
+    assert float(torch.pdist(surface).max()) == pytest.approx(width, rel=1e-6)
+    assert float(flat[:, 2].abs().max()) < 1e-9
+    widths = [float(torch.pdist(shape).max()) for shape in (surface, *between, flat)]
+    assert widths == sorted(widths)  # it opens all the way, and never shrinks to a heap
+    assert (tmp_path / "unroll.gif").stat().st_size > 1_000
 
 
 def test_texel_density(tmp_path):

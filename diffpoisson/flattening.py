@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffpoisson.certificate import count_flips, is_simple
 from diffpoisson.mesh import Mesh
-from diffpoisson.parameterization import SlimResult, slim, tutte
+from diffpoisson.parameterization import SlimResult, harmonic_disk, slim, tutte
 from diffpoisson.poisson import PoissonSolver
 from diffpoisson.repair import clamp_flips, untangle
 
@@ -64,7 +64,13 @@ def flatten_disk(
             flattening = stages.polished(injective=injective and stages.simple, **polish)
             if flattening.simple or not injective:
                 return flattening
-    stages.start("tutte", lambda: tutte(mesh))
+    stages.start("tutte", lambda: harmonic_disk(mesh))
+    if stages.flips:
+        # Deep surfaces shrink exponentially in an embedding, which SLIM may not undo; the harmonic
+        # map, with the flips out of it, is closer to an isometry.
+        stages.run("untangle", lambda uv: untangle(mesh, uv)[0])
+        if stages.flips or not stages.simple:
+            stages.start("tutte", lambda: tutte(mesh))
     return stages.polished(injective=injective, **polish)
 
 

@@ -224,6 +224,46 @@ def uv() -> str:
     )
 
 
+def uv_ablation() -> str:
+    """Variants of the UV network, from `tests/benchmarks/uv_ablation.py`."""
+    result = json.loads((RESULTS / "uv_ablation.json").read_text())
+    columns = [name for name in next(iter(result["variants"].values())) if name != "patches"]
+    lines = [f"| | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    for name, row in result["variants"].items():
+        cells = [f"{row[c]:,}" if c == "steps" else number(row[c]) for c in columns]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    patches = next(iter(result["variants"].values()))["patches"]
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"{result['minutes']:.0f} minutes of processor time each, one seed, "
+            f"{result['training patches']:,} patches to train on, {patches} of the validation split.",
+        ]
+    )
+
+
+def uv_certified() -> str:
+    """Patches that no network saw, from `tests/benchmarks/uv_certified.py`."""
+    result = json.loads((RESULTS / "uv_certified.json").read_text())
+    methods = ", ".join(f"{name} {count:,}" for name, count in result["methods"].items())
+    rows = {
+        "patches of 500 to 2,000 faces": f"{result['patches']:,} of {result['meshes']:,} meshes",
+        "with a flip": f"{result['patches with a flip']}",
+        "not certified to be one-to-one": f"{result['not certified']}",
+        "symmetric Dirichlet, median, 99%, worst": ", ".join(
+            number(result[f"energy, {name}"]) for name in ("median", "99%", "worst")
+        ),
+        "processor seconds each, median, worst": ", ".join(
+            number(result[f"processor seconds, {name}"]) for name in ("median", "worst")
+        ),
+        "came through": methods,
+    }
+    return "\n".join(
+        ["| | |", "|---|---|", *(f"| {name} | {cell} |" for name, cell in rows.items())]
+    )
+
+
 def uv_card() -> str:
     """The card of the shipped weights."""
     weights = DOCS.parent / "njf_models" / "weights"
@@ -324,6 +364,8 @@ TABLES = {
     "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,
+    "uv_ablation": uv_ablation,
+    "uv_certified": uv_certified,
     "uv_card": uv_card,
     "notices": notices,
     "cli_trial": cli_trial,
@@ -340,7 +382,7 @@ TABLES = {
 
 def number(value: float | None) -> str:
     """Three significant digits; JSON's null stands for infinity."""
-    return "∞" if value is None else f"{value:.3g}"
+    return "∞" if value is None or value == float("inf") else f"{value:.3g}"
 
 
 def updated(text: str) -> str:

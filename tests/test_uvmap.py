@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 import diffpoisson as dp
 from diffpoisson import flattening
-from tests import meshes, references
+from tests import meshes
 from tests.checks import assert_near
+from tests.test_parameterization import references, tube
 from tests.test_repair import spoiled
 
 
@@ -160,6 +161,16 @@ def test_result_does_not_depend_on_unit():
     a, b = dp.parameterize(mesh, uv), dp.parameterize(large, 1e5 * uv)
     assert b.energy == pytest.approx(a.energy, rel=1e-6)
     assert_near(b.uv / 1e5, a.uv, 1e-3)
+
+
+@pytest.mark.parametrize(("along", "method"), [(10, "tutte"), (60, "tutte+untangle")])
+def test_deep_tubes_do_not_shrink_to_a_point(along, method):
+    """Of a map that shrinks them exponentially, SLIM makes nothing (its energy stays at 1e15)."""
+    mesh = dp.Mesh(*tube(6, along))
+    uvmap = dp.parameterize(mesh)
+    assert_valid(mesh, uvmap)
+    assert uvmap.method == method
+    assert uvmap.energy < 3 * along  # each ring must be laid out around the others
 
 
 def winding_strip(turns: float, size: int = 24) -> dp.Mesh:

@@ -237,8 +237,8 @@ def uv_ablation() -> str:
         [
             *lines,
             "",
-            f"{result['minutes']:.0f} minutes of processor time each, one seed, "
-            f"{result['training patches']:,} patches to train on, {patches} of the validation split.",
+            f"{result['minutes']:.0f} minutes of processor time each, one seed; "
+            f"{result['training patches']:,} patches to train on, {patches} to validate.",
         ]
     )
 

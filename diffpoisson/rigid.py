@@ -93,6 +93,11 @@ def as_rigid_as_possible(
     for x in given:
         require_tensor("as_rigid_as_possible", "pins, handles and start", x, mesh.device)
         require_single_or_double("as_rigid_as_possible", "pins, handles and start", x)
+        if x.ndim < 2:
+            raise ValueError(
+                "as_rigid_as_possible: expected pins, handles and start of shapes (…, p, c), "
+                f"(…, h, c) and (…, n, c), got {tuple(x.shape)}"
+            )
     dtype = given[0].dtype if given else mesh.dtype
     pins, handles, start = (None if x is None else x.double() for x in (pins, handles, start))
     phi = _start(mesh, given, start)

@@ -643,6 +643,63 @@ def _draw_slim(rng: Rng) -> Arguments:
     return {"mesh": m, "init": dp.tutte(m), "tolerance": 1e-3, "max_iterations": 3}
 
 
+def _rotated(rng: Rng) -> tuple[int, int]:
+    return ((2, 2), (3, 2), (3, 3))[int(rng.integers(3))]
+
+
+def check_rotations(a: Arguments, Q: Tensor) -> None:
+    """Orthonormal columns; right-handed where square."""
+    require(Q.shape == a["J"].shape, "shape")
+    if not sound(a["J"]):
+        return
+    rounding, Q = torch.finfo(Q.dtype).eps, Q.double()
+    require(((Q.mT @ Q - torch.eye(Q.shape[-1])).abs() < 20 * rounding).all(), "orthonormal")
+    if Q.shape[-1] == Q.shape[-2]:
+        require((torch.linalg.det(Q) > 0).all(), "right-handed")
+
+
+def _draw_rigid(rng: Rng) -> Arguments:
+    """Few steps, or steps to a tolerance that may be out of reach: then None, for no tolerance."""
+    m = mesh(rng)
+    kind = str(rng.choice(["pins", "handles"]))
+    chosen = some_vertices(rng, m)
+    images = m.vertices[chosen].double() + torch.from_numpy(rng.normal(size=(len(chosen), m.dim)))
+    solver = dp.PoissonSolver(m, **{kind: chosen})
+    return {"solver": solver, kind: images, "tolerance": None, "max_steps": int(rng.integers(1, 4))}
+
+
+def _rigid(**arguments: Any) -> Tensor:
+    try:
+        return dp.as_rigid_as_possible(**arguments)
+    except RuntimeError as error:  # a tolerance that a spoilt argument brought in
+        require("not converged" in str(error), "an error that says so")
+        raise ValueError(str(error)) from error
+
+
+def check_rigid(a: Arguments, result: dp.RigidMap) -> None:
+    """Finite, pins met, energies that never grow."""
+    m = a["solver"].mesh
+    given = a.get("pins", a.get("handles"))
+    require(result.vertices.shape[-2] == m.n_vertices, "shape")
+    require(result.vertices.dtype == given.dtype, "dtype")
+    if not all(sound(x) for x in a.values() if isinstance(x, Tensor)):
+        return
+    require(result.vertices.isfinite().all(), "finite")
+    size = max(float(given.abs().max()), float(m.vertices.abs().max()))
+    if "pins" in a:
+        missed = result.vertices[..., a["solver"].constraints.pins, :] - given
+        require(float(missed.abs().max()) <= 1e-5 * size, "pins")
+    # Each gradient is right up to roundings of the terms it sums, which thin cells make large.
+    x = result.vertices.detach().double().reshape(-1, m.n_vertices, m.dim).abs().amax(0).numpy()
+    terms = np.abs(gradient_operator(m).matrix) @ x
+    weights = np.tile(m._double_measures.numpy(), m.cell_dim)
+    scale = float(weights @ (terms**2).sum(1)) + float(weights.sum())
+    growth = result.energies[..., 1:] - result.energies[..., :-1]
+    require(
+        (growth <= (1e5 * unit(torch.float64) + 100 * unit(given.dtype)) * scale).all(), "energies"
+    )
+
+
 def _draw_planar(rng: Rng) -> Arguments:
     """A disk with a map that is flat, perturbed, or noise."""
     m = dp.Mesh(*meshes.disk(int(rng.integers(100)), 4))
@@ -741,6 +798,13 @@ OPERATIONS: dict[str, Operation] = {
     ),
     "tutte": Operation(_draw_disk, dp.tutte, check_uv, 0.5),
     "slim": Operation(_draw_slim, dp.slim, lambda a, result: check_uv(a, result.uv), 0.5),
+    "as_rigid_as_possible": Operation(_draw_rigid, _rigid, check_rigid),
+    "closest_rotation": Operation(
+        lambda rng: {"J": torch.from_numpy(rng.normal(size=(4, *_rotated(rng))))},
+        dp.closest_rotation,
+        check_rotations,
+        0.4,
+    ),
     "solve_poisson": Operation(_draw_one_shot, dp.solve_poisson, _check_one_shot),
     "parameterize": Operation(_draw_parameterize, dp.parameterize, check_parameterized, 0.3),
     "certify": Operation(_draw_planar, dp.certify, check_certificate, 0.7),

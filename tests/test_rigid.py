@@ -287,7 +287,7 @@ def test_mistakes(unchecked):
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])
-def test_images_of_too_few_axes_are_named(shape):
+def test_images_of_too_few_axes_are_named(shape, unchecked):
     solver = dp.PoissonSolver(dp.Mesh(*meshes.disk()), pins=torch.tensor([0]))
     with pytest.raises(ValueError, match=r"as_rigid_as_possible: expected pins, handles and start"):
         dp.as_rigid_as_possible(solver, pins=torch.zeros(shape, dtype=torch.float64))

@@ -15,8 +15,8 @@ import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
 from njf_models.losses import paper_loss
 from njf_models.metrics import count_distorted, count_flips, l2_jacobians, l2_vertices
-from njf_models.njf import NeuralJacobianField, Prediction
-from njf_models.training import Batch, UVExamples
+from njf_models.njf import Prediction
+from njf_models.training import Batch, Model, UVExamples
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class UVRecord:
 
 @torch.no_grad()
 def evaluate_uv(
-    model: NeuralJacobianField, examples: UVExamples
+    model: Model, examples: UVExamples
 ) -> tuple[list[UVRecord], list[Float[Tensor, "n 2"]]]:
     """Map each patch on its own: the records, and the maps."""
     was_training = model.training

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import diffpoisson as dp
+from njf_models.spectrum import Spectrum
 
 
 def face_features(mesh: dp.Mesh, wks: Float[Tensor, "n k"] | None = None) -> Float[Tensor, "m f"]:
@@ -146,14 +147,16 @@ class Shape:
         features: (m, f) centroid features in the network's dtype.
         frames: (m, 3, 2) the faces' tangent bases in the pose that the features describe; the
             operators are intrinsic and know no pose.
-        vertex_features: (n, f) features of the vertices, for models of maps by their values.
+        vertex_features: (n, v) features of the vertices, for models of maps by their values.
+        spectra: of each part, for models that diffuse; none if not asked for.
     """
 
     mesh: dp.Mesh
     solver: dp.PoissonSolver
     features: Float[Tensor, "m f"]
     frames: Float[Tensor, "m 3 2"]
-    vertex_features: Float[Tensor, "n f"]
+    vertex_features: Float[Tensor, "n v"]
+    spectra: tuple[Spectrum, ...] = ()
 
     @classmethod
     def prepare(
@@ -162,12 +165,17 @@ class Shape:
         wks: Float[Tensor, "n k"] | None = None,
         dtype: torch.dtype = torch.float32,
         solver: dp.PoissonSolver | None = None,
+        n_eigenpairs: int = 0,
     ) -> Shape:
-        """The features of a mesh's faces and vertices, and its solver if it is not given."""
+        """The features of a mesh's faces and vertices, and its solver if it is not given.
+
+        With so many eigenpairs in its spectrum, if any.
+        """
         features = face_features(mesh, wks).to(dtype)
         at_vertices = vertex_features(mesh, wks).to(dtype)
         solver = solver or dp.PoissonSolver(mesh)
-        return cls(mesh, solver, features, mesh.frames.to(dtype), at_vertices)
+        spectra = (Spectrum.of(mesh, n_eigenpairs, solver),) if n_eigenpairs else ()
+        return cls(mesh, solver, features, mesh.frames.to(dtype), at_vertices, spectra)
 
     @classmethod
     def concatenate(cls, shapes: Sequence[Shape]) -> Shape:
@@ -177,7 +185,8 @@ class Shape:
             torch.cat([getattr(shape, name) for shape in shapes])
             for name in ("features", "frames", "vertex_features")
         )
-        return cls(solver.mesh, solver, features, frames, at_vertices)
+        spectra = tuple(spectrum for shape in shapes for spectrum in shape.spectra)
+        return cls(solver.mesh, solver, features, frames, at_vertices, spectra)
 
     @cached_property
     def face_weights(self) -> Float[Tensor, "m"]:

@@ -25,6 +25,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
 from njf_models.baselines.cages import CageDeformation
+from njf_models.baselines.diffusion import DiffusionEncodedNJF, DiffusionMap
 from njf_models.baselines.displacement import DisplacementField
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
@@ -97,6 +98,7 @@ class UVExamples(Dataset[Example]):
         n_points: how many points the encoder sees.
         resample: draw new points at each access (training) or always the same (evaluation).
         use_wks: whether the network sees the wave-kernel signature.
+        n_eigenpairs: of the spectrum, for models that diffuse.
     """
 
     def __init__(
@@ -106,9 +108,11 @@ class UVExamples(Dataset[Example]):
         n_points: int = 1024,
         resample: bool = False,
         use_wks: bool = True,
+        n_eigenpairs: int = 0,
     ) -> None:
         self.patches = patches
         self.n_points, self.resample, self.use_wks = n_points, resample, use_wks
+        self.n_eigenpairs = n_eigenpairs
         self._kept: dict[int, tuple[UVPatch, Shape]] = {}
 
     def __len__(self) -> int:
@@ -128,7 +132,8 @@ class UVExamples(Dataset[Example]):
     def _prepared(self, index: int) -> tuple[UVPatch, Shape]:
         if index not in self._kept:
             patch = self.patches[index]
-            shape = Shape.prepare(patch.mesh, patch.wks if self.use_wks else None)
+            wks = patch.wks if self.use_wks else None
+            shape = Shape.prepare(patch.mesh, wks, n_eigenpairs=self.n_eigenpairs)
             self._kept[index] = patch, shape
         return self._kept[index]
 
@@ -208,11 +213,15 @@ class _Stopwatch:
         self.earlier, self.started = self.seconds, None
 
 
-Model = NeuralJacobianField | DisplacementField | CageDeformation
+Model = (
+    NeuralJacobianField | DisplacementField | CageDeformation | DiffusionMap | DiffusionEncodedNJF
+)
 MODELS: dict[str, type[Model]] = {
     "njf": NeuralJacobianField,
     "displacement": DisplacementField,
     "cages": CageDeformation,
+    "diffusion": DiffusionMap,
+    "diffusion+njf": DiffusionEncodedNJF,
 }
 
 

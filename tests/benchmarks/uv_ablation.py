@@ -90,6 +90,14 @@ def trained(variant: Variant, examples: UVExamples, seconds: float) -> TimedTrai
     module = TimedTraining(
         model | {"output_dim": 2} | SHIPPED | variant.model, OBJECTIVE | variant.objective
     )
+    fit(module, examples, seconds)
+    return module
+
+
+def fit(module: TimedTraining, examples: UVExamples, seconds: float) -> None:
+    """Train for a time, in which factors and features are not counted."""
+    for index in tqdm(range(len(examples)), desc="factors and features"):
+        examples[index]  # kept
     module.seconds = seconds
     trainer = lightning.Trainer(
         accelerator="cpu",
@@ -99,7 +107,6 @@ def trained(variant: Variant, examples: UVExamples, seconds: float) -> TimedTrai
         enable_model_summary=False,
     )
     trainer.fit(module, loader(examples, 8, shuffle=True))
-    return module
 
 
 def figures(module: TimedTraining, examples: UVExamples) -> dict[str, float]:
@@ -143,8 +150,6 @@ def main() -> None:
             )
             for part in ("train", "validation")
         )
-        for index in tqdm(range(len(train)), desc="factors and features"):
-            train[index]  # kept, so that training spends no time on it
         for name in todo:
             module = trained(VARIANTS[name], train, 60 * options.minutes)
             result["variants"][name] = figures(module, validation)

@@ -30,9 +30,10 @@ def nearest_rotation(J: Matrices) -> Matrices:
     """
     size = J.detach().abs().amax((-2, -1), keepdim=True)
     J = J / torch.where(size > 0, size, 1)
-    Q = _by_singular_vectors(J.detach())
-    for _ in range(_STEPS):
-        Q = Q @ _cayley(_newton(Q.mT @ J))
+    with torch.autocast(J.device.type, enabled=False):  # it would round to half precision
+        Q = _by_singular_vectors(J.detach())
+        for _ in range(_STEPS):
+            Q = Q @ _cayley(_newton(Q.mT @ J))
     return Q
 
 

@@ -11,6 +11,7 @@ import re
 import sys
 from collections import Counter, defaultdict
 from pathlib import Path
+from typing import NamedTuple
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
@@ -299,6 +300,12 @@ def uv_card() -> str:
     return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
 
 
+def repose_card() -> str:
+    """The card of the shipped weights for poses."""
+    card = json.loads((DOCS.parent / "njf_models" / "weights" / "repose.json").read_text())
+    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {x} |" for name, x in card.items())])
+
+
 def notices() -> str:
     """Where the meshes come from that the shipped weights were trained on."""
     weights = DOCS.parent / "njf_models" / "weights"
@@ -314,7 +321,7 @@ def notices() -> str:
 
 
 def repose() -> str:
-    """Re-posing of unseen bodies, from `examples/repose.py`."""
+    """Re-posing of unseen bodies, from `examples/body_maps.py`."""
     results = json.loads((RESULTS / "repose.json").read_text())
     summary, options, costs = (results[name] for name in ("summary", "options", "training"))
     paper = {"ours": 0.84, "displacement": 4.21, "cages": 3.87}  # L2-V from the T-pose
@@ -330,34 +337,300 @@ def repose() -> str:
     figures = [paper["ours"], *(paper[name] for name in theirs)]
     figures += [x / paper["ours"] for x in figures[1:]]
     lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(map(number, figures))} |")
-    spent = "; ".join(
-        f"{name}: {c['steps']:,} steps, {c['cpu seconds'] / 60:.1f} minutes of CPU time"
-        for name, c in costs.items()
-    )
+    spent = "; ".join(f"{name}: {spent_on(cost)}" for name, cost in costs.items())
     return "\n".join(
         [
             *lines,
             "",
             f"Trained on {options['bodies']} bodies in {options['poses']} poses each, of "
-            f"{options['faces']:,} faces, {options['targets']} poses a step, code of size "
-            f"{options['code_size']}, one seed. {spent[0].upper()}{spent[1:]}.",
+            f"{options['faces']:,} faces, code of size {options['code_size']}, one seed; a sampled "
+            f"step has {options['cells']} cells of {options['per_step']} bodies in "
+            f"{options['targets']} poses each, a whole one a body in as many. "
+            f"{spent[0].upper()}{spent[1:]}.",
         ]
     )
+
+
+def spent_on(cost: dict) -> str:
+    """Steps and time of a training of `examples/body_maps.py`."""
+    steps = " and ".join(f"{n:,} {phase}" for phase, n in cost["steps"].items())
+    return f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+
+
+def body_tasks() -> str:
+    """The other tasks of `examples/body_maps.py`, beside the paper's figures."""
+    paper = {  # L2-V, L2-J, L2-N
+        "any-pose": (1.84, 1.55, 4.4),
+        "registration": (3.24, 3.01, 9.9),
+        "morphing": (2.00, 2.80, 8.2),
+    }
+    columns = ("L2-V", "L2-J", "L2-N, degrees")
+    head = [f"{c}: identity / ours / paper" for c in columns]
+    lines = [f"| | from | maps | {' | '.join(head)} | training |", "|---" * 7 + "|"]
+    for task, figures in paper.items():
+        path = RESULTS / f"{task}.json"
+        if not path.exists():
+            cells = [f"– / – / {number(x)}" for x in figures]
+            lines.append(f"| {task} | – | – | {' | '.join(cells)} | none yet |")
+            continue
+        results = json.loads(path.read_text())
+        before, after = (results["summary"][name] for name in ("untrained", "ours"))
+        cells = [
+            f"{number(before[c])} / {number(after[c])} / {number(x)}"
+            for c, x in zip(columns, figures, strict=True)
+        ]
+        start = "the rest pose" if results["options"]["sources"] == 0 else "any pose"
+        spent = spent_on(results["training"]["ours"])
+        lines.append(f"| {task} | {start} | {after['maps']:.0f} | {' | '.join(cells)} | {spent} |")
+    return "\n".join(lines)
+
+
+def far_bodies() -> str:
+    """Bodies outside the range of training, from `examples/far_body.py`."""
+    results = json.loads((RESULTS / "far_bodies.json").read_text())
+    columns = ("L2-V", "L2-J", "L2-N, degrees")
+    lines = [f"| body | maps | {' | '.join(columns)} |", "|---" * 5 + "|"]
+    for name, row in results.items():
+        cells = [number(row[column]) for column in columns]
+        lines.append(f"| {name} | {row['maps']:.0f} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def triangulations() -> str:
     """Maps of the same bodies on several triangulations, from `examples/triangulations.py`."""
     results = json.loads((RESULTS / "triangulations.json").read_text())
     ours = results["deviations"].pop("ours")
-    head = ["faces", "error, mm", "deviation, mm", "deviation / own error, %"]
+    head = ["faces", "error, mm", "deviation, mm", "of exact maps, mm", "deviation / own error, %"]
     head += [f"the same, {name}" for name in results["deviations"]]
     lines = [f"| triangulation | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
     for name, row in ours.items():
-        cells = [1000 * row["error"], 1000 * row["deviation"], 100 * row["share"]]
+        cells = [1000 * row[x] for x in ("error", "deviation", "exact")] + [100 * row["share"]]
         cells += [100 * others[name]["share"] for others in results["deviations"].values()]
         lines.append(f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} |")
     about = f"{results['bodies']} unseen bodies in {results['poses']} poses each."
     return "\n".join([*lines, "", about])
+
+
+def arap() -> str:
+    """Deformation of a solid from its handles, from `examples/arap.py`."""
+    results = json.loads((RESULTS / "arap.json").read_text())
+    summary, options, solver = (results[name] for name in ("summary", "options", "solver"))
+    ours, theirs = summary["ours"], summary["global MLP"]
+    maps = f"{ours['maps']:.0f} unseen positions of the handles"
+    pinned = [summary[f"{name}, pinned"] for name in ("ours", "global MLP")]
+    other = json.loads((RESULTS / "arap_field.json").read_text())
+    field = other["summary"]["the paper's field"]
+    head = ["untrained: identity", "ours", "global MLP", "global MLP / ours"]
+    head += ["ours, pinned", "global MLP, pinned", "the paper's field, trained longer"]
+    lines = [f"| {maps} | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
+    for name in ours:
+        if name not in ("maps", "CPU milliseconds, median"):  # of which there is a table below
+            cells = [
+                summary["untrained"][name],
+                ours[name],
+                theirs[name],
+                theirs[name] / ours[name],
+            ]
+            cells += [of_model[name] for of_model in (*pinned, field)]
+            lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
+    lines.append("| L2-V of the paper, on Raptor | – | 0.64 | 3.66 | 5.7 | – | – | 0.64 |")
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Learned from {options['maps']:,} maps of {solver['tetrahedra']:,.0f} tetrahedra, one "
+            f"seed. {spent(results['training'] | other['training'])} The solver on the test maps: "
+            f"{solver['iterations, mean']:.0f} accelerated steps in the mean, residual at most "
+            f"{solver['largest residual']:.1e} of the size, "
+            f"{solver['flipped tetrahedra, mean']:.1f} flipped tetrahedra in the mean, "
+            f"{solver['flipped tetrahedra, most']:.0f} at most.",
+        ]
+    )
+
+
+def arap_speed() -> str:
+    """The network against the ARAP solver, from `tests/benchmarks/arap_speed.py`."""
+    results = json.loads((RESULTS / "arap_speed.json").read_text())
+    columns = {
+        "tetrahedra": "tetrahedra",
+        "faces": "faces",
+        "solver, iterations": "solver, steps",
+        "solver, s": "solver, s",
+        "accelerated, s": "accelerated, s",
+        "preparation, s": "preparation, s",
+        "network, s": "a map, s",
+        "speed-up": "speed-up",
+        "speed-up over the accelerated": "over the accelerated",
+        "L2-V": "L2-V",
+        "L2-N, degrees": "L2-N, degrees",
+        "maps": "maps",
+    }
+    lines = ["| " + " | ".join(columns.values()) + " |", "|---" * len(columns) + "|"]
+    rows = [[size(row[name]) for name in columns] for row in results.values()]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def contact() -> str:
+    """The block and the star, from `examples/contact.py`."""
+    results = json.loads((RESULTS / "contact.json").read_text())
+    summary, options = results["summary"], results["options"]
+    head = ["untrained: identity", "ours", "offsets"]
+    maps = f"{summary['ours']['maps']:.0f} states of {options['held_out']} unseen trajectories"
+    lines = [f"| {maps} | {' | '.join(head)} |", "|---|---|---|---|"]
+    for name in summary["ours"]:
+        if name not in ("maps", "CPU milliseconds, median"):
+            cells = [summary[of][name] for of in ("untrained", "ours", "offsets")]
+            lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
+    lines.append("| L2-V of the paper, on Romero et al.'s data | – | 0.398 | 0.424 |")
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Learned from the states of {options['trajectories']} trajectories, one seed. "
+            f"{spent(results['training'])}",
+        ]
+    )
+
+
+def spent(costs: dict[str, dict]) -> str:
+    """Steps and CPU time of each model, as a sentence."""
+    parts = [
+        f"{name}: {cost['steps']:,} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+        for name, cost in costs.items()
+    ]
+    sentence = "; ".join(parts)
+    return f"{sentence[0].upper()}{sentence[1:]}."
+
+
+def size(value: float) -> str:
+    """A number, with its thousands apart if it is large."""
+    return f"{value:,.0f}" if value >= 1000 else number(value)
+
+
+class Row(NamedTuple):
+    """A row of the paper's Tables 1 and 2, and where its counterpart is.
+
+    Attributes:
+        experiment: its name.
+        quantity: what the paper counts, our name for it in the result.
+        ours: the paper's figure of its method.
+        theirs: that of the baseline.
+        baseline: its name.
+        result: file of the counterpart, None where there is none yet.
+        columns: of the summary, of our method and of the baseline; None if that is not there.
+        data: what the counterpart was measured on.
+    """
+
+    experiment: str
+    quantity: str
+    ours: float
+    theirs: float | None = None
+    baseline: str = ""
+    result: str | None = None
+    columns: tuple[str, str | None] = ("ours", None)
+    data: str = ""
+
+
+_PATCHES = "unfiltered patches of other meshes, by the shipped network"
+_ANNY = "anny's bodies, not STAR"
+PAPER = [
+    Row("UV", "patches with a flip, raw, %", 19, None, "", "uv", ("all", None), _PATCHES),
+    Row("UV", "flips per patch, raw", 3.44, None, "", "uv", ("all", None), _PATCHES),
+    Row(
+        "UV",
+        "D>10 per patch, raw",
+        5.67,
+        158.7,
+        "DiffusionNet",
+        "uv",
+        ("all", None),
+        _PATCHES,
+    ),
+    Row(
+        "re-posing from rest",
+        "L2-V",
+        0.84,
+        4.21,
+        "displacement field",
+        "repose",
+        ("ours", "displacement"),
+        _ANNY,
+    ),
+    Row(
+        "re-posing from rest",
+        "L2-V",
+        0.84,
+        3.87,
+        "Neural Cages",
+        "repose",
+        ("ours", "cages"),
+        _ANNY,
+    ),
+    *(
+        Row(experiment, quantity, value, result=result, data=_ANNY)
+        for experiment, result, values in (
+            ("re-posing, any to any", "any-pose", (1.84, 1.55, 4.4)),
+            ("registration", "registration", (3.24, 3.01, 9.9)),
+            ("morphing", "morphing", (2.00, 2.80, 8.2)),
+        )
+        for quantity, value in zip(("L2-V", "L2-J", "L2-N, degrees"), values, strict=True)
+    ),
+    Row(
+        "volumetric ARAP",
+        "L2-V",
+        0.64,
+        3.66,
+        "global MLP",
+        "arap",
+        ("ours", "global MLP"),
+        "a generated lizard, not Raptor",
+    ),
+    Row(
+        "contact",
+        "L2-V",
+        0.398,
+        0.424,
+        "offsets of vertices",
+        "contact",
+        ("ours", "offsets"),
+        "a block and a star, not Romero et al.'s data",
+    ),
+]
+
+
+def paper() -> str:
+    """All rows of the paper's Tables 1 and 2 beside what there is here."""
+    head = ["experiment", "quantity", "paper: ours", "baseline", "ratio"]
+    head += ["here: ours", "baseline", "ratio", "CPU minutes", "baseline is", "data here"]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for row in PAPER:
+        cells = [row.experiment, row.quantity, *ratio(row.ours, row.theirs), *counterpart(row)]
+        lines.append("| " + " | ".join([*cells, row.baseline or "–", row.data or "–"]) + " |")
+    return "\n".join(lines)
+
+
+def ratio(ours: float, theirs: float | None) -> list[str]:
+    """Two errors and the quotient of the second and the first."""
+    if theirs is None:
+        return [number(ours), "–", "–"]
+    return [number(ours), number(theirs), number(theirs / ours)]
+
+
+def counterpart(row: Row) -> list[str]:
+    """The same of our result."""
+    path = RESULTS / f"{row.result}.json"
+    if row.result is None or not path.exists():
+        return ["not yet", "not yet" if row.baseline else "–", "–", "–"]
+    results = json.loads(path.read_text())
+    summary = results.get("summary") or results["raw"]
+    ours, theirs = row.columns
+    cells = ratio(summary[ours][row.quantity], None)
+    if theirs in summary:
+        cells = ratio(summary[ours][row.quantity], summary[theirs][row.quantity])
+    elif row.baseline:
+        cells[1] = "not yet"
+    cost = results.get("training", {}).get(ours, {}).get("cpu seconds")
+    return [*cells, "–" if cost is None else number(cost / 60)]
 
 
 def data_cost() -> str:
@@ -387,7 +660,13 @@ def data_cost() -> str:
 
 
 TABLES = {
+    "paper": paper,
+    "arap": arap,
+    "arap_speed": arap_speed,
+    "contact": contact,
     "repose": repose,
+    "body_tasks": body_tasks,
+    "far_bodies": far_bodies,
     "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,
@@ -395,6 +674,7 @@ TABLES = {
     "uv_certified": uv_certified,
     "uv_diffusion": uv_diffusion,
     "uv_card": uv_card,
+    "repose_card": repose_card,
     "notices": notices,
     "cli_trial": cli_trial,
     "uv_robustness": uv_robustness,
@@ -410,7 +690,7 @@ TABLES = {
 
 def number(value: float | None) -> str:
     """Three significant digits; JSON's null stands for infinity."""
-    return "∞" if value is None or value == float("inf") else f"{value:.3g}"
+    return "∞" if value is None else f"{value:.3g}"
 
 
 def updated(text: str) -> str:

@@ -1,8 +1,9 @@
 """Does the map depend on how the surface is cut into triangles? Bodies re-posed on several meshes.
 
-Takes the networks that `examples/repose.py` has trained, on one coarse triangulation, and re-poses
-the test bodies on others: the original, decimated and subdivided ones, and one that is fine at the
-head and coarse at the feet. Corresponding points are known exactly, so the maps can be compared.
+Takes the networks that `examples/body_maps.py` has trained, on one coarse triangulation, and
+re-poses the test bodies on others: the original, decimated and subdivided ones, and one that is
+fine at the head and coarse at the feet. Corresponding points are known exactly, so the maps can be
+compared.
 
 The default takes a few minutes on two cores; `--full` takes all test bodies and poses. Writes
 triangulations.json to the folder of the run.
@@ -46,10 +47,11 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, Deviation]]:
             others=others,
             bodies=bodies,
         )
-        print(f"\n{title}: triangulation, faces, error and deviation in mm, deviation / own error")
+        print(f"\n{title}: triangulation, faces, error, deviation, exact maps', in mm; / own error")
         for name, d in table[title].items():
             print(
                 f"{name:<24}{d.n_faces:>8}{1000 * d.error:>8.2f}{1000 * d.deviation:>8.2f}"
+                f"{1000 * d.exact:>8.2f}"
                 f"{100 * d.share:>8.1f}%"
             )
     results = {
@@ -70,14 +72,14 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--run", type=Path, default=Path("runs/repose"), help="what repose.py wrote (runs/repose)")
+    add("--run", type=Path, default=Path("runs/repose"), help="a run of body_maps.py")
     add("--data", type=Path, help="folder of the bodies (RUN/bodies)")
     add("--bodies", type=int, default=4, metavar="N", help="test identities (4)")
     add("--poses", type=int, default=4, metavar="N", help="of each (4)")
     add("--full", action="store_true", help="all test bodies in all of their poses")
     options = parser.parse_args(argv)
     if not (options.run / "njf" / "checkpoints" / "best.ckpt").exists():
-        parser.error(f"no trained networks in {options.run}: run examples/repose.py first")
+        parser.error(f"no trained networks in {options.run}: run examples/body_maps.py first")
     options.data = options.data or options.run / "bodies"
     return options
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,7 +16,7 @@ from torch import Tensor
 import diffpoisson as dp
 from njf_models.rendering import splat
 
-ERROR_LIMIT = 0.1  # metres: where the colours of the error end
+ERROR_LIMIT = 0.1  # metres: where the colours of the error end, unless said otherwise
 _GREEN, _BLUE = (0.45, 0.72, 0.45), (0.42, 0.58, 0.85)
 _LIGHT = np.array([0.3, 0.4, 0.87])  # right, up, towards the camera
 _SAMPLES = 8  # on a pixel's area of the surface, so that one is missed once in e⁸ at most
@@ -24,24 +24,31 @@ _AZIMUTH, _ELEVATION = 0.5, 0.1  # of the camera, from the front; radians
 
 
 class BodyRow(NamedTuple):
-    """One map in a report: its name, source, target, and predictions to compare by title."""
+    """One map in a report: its name, source, target, and predictions to compare by title.
+
+    Without a target, predictions have its colour, and no error.
+    """
 
     title: str
     faces: Int[Tensor, "m 3"]
     source: Float[Tensor, "n 3"]
-    target: Float[Tensor, "n 3"]
+    target: Float[Tensor, "n 3"] | None
     predictions: dict[str, Float[Tensor, "n 3"]]
 
 
-def save_body_report(rows: Sequence[BodyRow], path: Path, size: int = 320) -> None:
+def save_body_report(
+    rows: Sequence[BodyRow], path: Path, size: int = 320, limit: float = ERROR_LIMIT
+) -> None:
     """A picture with source, target and the predictions of each map.
 
     Args:
-        rows: the maps; all with the same titles of predictions.
+        rows: the maps; all with the same titles of predictions, and all with targets or none.
         path: the PNG to write.
         size: pixels of each body.
+        limit: metres where the colours of the error end.
     """
-    titles = ["source", "target", *rows[0].predictions]
+    has_targets = rows[0].target is not None
+    titles = ["source", *(["target"] if has_targets else []), *rows[0].predictions]
     figure, axes = plt.subplots(
         len(rows),
         len(titles),
@@ -50,15 +57,20 @@ def save_body_report(rows: Sequence[BodyRow], path: Path, size: int = 320) -> No
         gridspec_kw={"wspace": 0, "hspace": 0.12},
     )
     for row, line in zip(rows, axes, strict=True):
-        for ax, title, image in zip(line, titles, _images(row, size), strict=True):
+        for ax, title, image in zip(line, titles, _images(row, size, limit), strict=True):
             ax.imshow(image)
             ax.set_axis_off()
             ax.set_title(title if row is rows[0] else "", fontsize=9)
         line[0].text(0.1, 0, row.title, transform=line[0].transAxes, va="top", fontsize=7)
-    scale = plt.cm.ScalarMappable(Normalize(0, 100 * ERROR_LIMIT), "viridis")
-    figure.colorbar(scale, ax=axes, shrink=0.5, label="distance from the target, cm")
+    if has_targets:
+        _add_scale(figure, axes, limit)
     figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)
+
+
+def _add_scale(figure: Any, axes: Any, limit: float) -> None:
+    scale = plt.cm.ScalarMappable(Normalize(0, 100 * limit), "viridis")
+    figure.colorbar(scale, ax=axes, shrink=0.5, label="distance from the target, cm")
 
 
 def render_body(
@@ -93,16 +105,20 @@ def render_body(
     return image.reshape(size, 2, size, 2, 3).mean(axis=(1, 3))
 
 
-def _images(row: BodyRow, size: int) -> list[np.ndarray]:
+def _images(row: BodyRow, size: int, limit: float) -> list[np.ndarray]:
     n = len(row.source)
-    images = [
-        render_body(row.source, row.faces, np.tile(_GREEN, (n, 1)), size),
-        render_body(row.target, row.faces, np.tile(_BLUE, (n, 1)), size),
-    ]
+
+    def plain(vertices: Tensor, colour: tuple[float, float, float]) -> np.ndarray:
+        return render_body(vertices, row.faces, np.tile(colour, (n, 1)), size)
+
+    source = plain(row.source, _GREEN)
+    if row.target is None:
+        return [source, *(plain(phi, _BLUE) for phi in row.predictions.values())]
+    images = [source, plain(row.target, _BLUE)]
     target = row.target - row.target.mean(dim=0)
     for phi in row.predictions.values():
         error = torch.linalg.vector_norm(phi - phi.mean(dim=0) - target, dim=1)
-        colours = plt.get_cmap("viridis")(error.numpy() / ERROR_LIMIT)[:, :3]
+        colours = plt.get_cmap("viridis")(error.numpy() / limit)[:, :3]
         images.append(render_body(phi, row.faces, colours, size))
     return images
 

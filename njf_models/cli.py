@@ -15,7 +15,7 @@ from njf_models.commands import CommandError, UsageError
 
 # In the order of `njf --help`. Each is a module of `njf_models.commands` with
 # `add_parser(subparsers)` and `run(options) -> exit code`, light to import.
-COMMANDS = ("uv", "info", "view", "data", "train")
+COMMANDS = ("uv", "info", "view", "repose", "data", "train")
 
 _EXIT_CODES = """\
 exit codes: 0 all went well, 1 something failed, 2 wrong usage, 130 interrupted

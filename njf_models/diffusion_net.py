@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-import diffpoisson as dp
 from njf_models.features import Shape
+from njf_models.spectrum import Spectrum
 
 
 class DiffusionBlock(nn.Module):
@@ -38,15 +38,20 @@ class DiffusionBlock(nn.Module):
     def forward(self, shape: Shape, u: Float[Tensor, "n w"]) -> Float[Tensor, "n w"]:
         """The channels at the vertices of a shape with spectra."""
         times = self.log_times.exp()
-        parts = shape.mesh.split_vertices(u)
-        spread = torch.cat(
-            [spectrum.diffused(x, times) for spectrum, x in zip(shape.spectra, parts, strict=True)]
+        parts = zip(shape.spectra, shape.mesh.split_vertices(u), strict=True)
+        seen = [torch.cat([x, *self._diffused(spectrum, x, times)], dim=1) for spectrum, x in parts]
+        return u + self.mlp(torch.cat(seen))
+
+    def _diffused(
+        self, spectrum: Spectrum, u: Float[Tensor, "n w"], times: Float[Tensor, "w"]
+    ) -> tuple[Float[Tensor, "n w"], Float[Tensor, "n w"]]:
+        """The diffused channels of one shape, and their gradient features."""
+        spread = spectrum.diffused(u, times)
+        z = spectrum.gradients(spread)
+        turned = torch.linalg.cross(
+            spectrum.normals.to(u.dtype).T[..., None].expand_as(z), self.imaginary(z), dim=0
         )
-        z = vertex_gradients(shape, spread)
-        normals = shape.vertex_features[:, 3:6, None].to(u.dtype)
-        turned = torch.linalg.cross(normals.expand_as(z), self.imaginary(z), dim=1)
-        products = torch.tanh((z * (self.real(z) + turned)).sum(1))
-        return u + self.mlp(torch.cat([u, spread, products], dim=1))
+        return spread, torch.tanh((z * (self.real(z) + turned)).sum(0))
 
 
 class DiffusionNet(nn.Module):
@@ -82,17 +87,3 @@ class DiffusionNet(nn.Module):
         for block in self.blocks:
             u = block(shape, u)
         return self.last(u)
-
-
-def vertex_gradients(shape: Shape, u: Float[Tensor, "n w"]) -> Float[Tensor, "n 3 w"]:
-    """Gradients of functions at the vertices: the mean over their faces, weighted by area.
-
-    In space, in the pose that the features describe, for a shape of unit area.
-    """
-    mesh = shape.mesh
-    at_faces = (dp.jacobians(mesh, u) @ shape.frames.mT.to(u.dtype)).mT  # (m, 3, w)
-    areas = mesh.areas.to(u.dtype)
-    sums = mesh.sum_at_vertices((areas[:, None, None] * at_faces).flatten(1))
-    means = sums / (3 * mesh.vertex_areas.to(u.dtype))[:, None]
-    unit = mesh.areas.new_zeros(mesh.n_parts).index_add(0, mesh.part_of_face, mesh.areas).sqrt()
-    return (unit.to(u.dtype)[mesh.part_of_vertex, None] * means).unflatten(1, (3, -1))

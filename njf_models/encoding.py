@@ -34,18 +34,19 @@ class CodedModel(nn.Module):
 
     def encode(
         self,
-        source: Float[Tensor, "#batch s f"] | None = None,
-        target: Float[Tensor, "#batch t f"] | None = None,
-        parameters: Float[Tensor, "#batch p"] | None = None,
-    ) -> Float[Tensor, "batch z"]:
+        source: Float[Tensor, "*#batch s f"] | None = None,
+        target: Float[Tensor, "*#batch t f"] | None = None,
+        parameters: Float[Tensor, "*#batch p"] | None = None,
+    ) -> Float[Tensor, "*batch z"]:
         """The global code: PointNet of source and target, and user parameters, side by side.
 
-        One source, encoded once, serves a batch of targets or parameters.
+        One source, encoded once, serves a batch of targets or parameters; so do several, each its
+        own, where an axis of size one stands for its targets.
 
         Args:
-            source: (batch or 1, s, f) point features of the sources, if the model has an encoder.
-            target: (batch, t, f) point features of the targets, if it encodes them.
-            parameters: (batch, p) user parameters, if it has any.
+            source: (…, s, f) point features of the sources, if the model has an encoder.
+            target: (…, t, f) point features of the targets, if it encodes them.
+            parameters: (…, p) user parameters, if it has any.
         """
         clouds = [cloud for cloud in (source, target) if cloud is not None]
         expected = 0 if self.encoder is None else 1 + self.encodes_target
@@ -55,8 +56,8 @@ class CodedModel(nn.Module):
             )
         codes = [self.encoder(cloud) for cloud in clouds] if self.encoder is not None else []
         codes += [] if parameters is None else [parameters]
-        batch = max((len(code) for code in codes), default=0)
-        code = torch.cat([code.expand(batch, -1) for code in codes], dim=-1)
+        batch = torch.broadcast_shapes(*(code.shape[:-1] for code in codes))
+        code = torch.cat([code.expand(*batch, -1) for code in codes], dim=-1)
         if code.shape[-1] != self.code_size:
             raise ValueError(
                 f"encode: the field expects a code of size {self.code_size}, "

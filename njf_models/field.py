@@ -1,7 +1,8 @@
-"""The neural field: one small MLP that turns a triangle's features and a code into a 3×3 matrix."""
+"""Neural fields: networks that turn a triangle's features and a code into a 3×3 matrix."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import torch
@@ -110,3 +111,105 @@ def _scaled_relu(x: Float[Tensor, "*rows channels"], norm: nn.GroupNorm) -> Tens
     groups = x.unflatten(-1, (norm.num_groups, -1))
     scaled = functional.rms_norm(groups, groups.shape[-1:], eps=norm.eps).flatten(-2)
     return torch.addcmul(norm.bias, scaled, norm.weight).relu_()
+
+
+class BilinearField(nn.Module):
+    """Σₖ hₖ(code) Tₖ(features): a network of the code and one of the face, multiplied at last.
+
+    As many functions on the surface as `rank`, and coefficients for each map. T does not depend on
+    the code, so that a step evaluates it once for all of its maps, and a map costs a product. Good
+    where one source has many targets, and a nonlinear code: T is a small network, h may be a large
+    one.
+
+    Args:
+        code_size: size of the global code.
+        in_features: number of features of each face.
+        out_features: number of outputs per face, the entries of its matrix.
+        width: size of the hidden layers of T; those of h are four times as wide.
+        rank: number of functions.
+    """
+
+    def __init__(
+        self,
+        code_size: int,
+        in_features: int,
+        out_features: int = 9,
+        width: int = 128,
+        rank: int = 128,
+    ) -> None:
+        super().__init__()
+        self.rank, self.out_features = rank, out_features
+        self.of_code = layered((code_size, *[4 * width] * 3, rank))
+        self.of_face = layered((in_features, *[width] * 3, rank * out_features))
+        last = self.of_face[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(
+        self,
+        features: Float[Tensor, "m f"],
+        code: Float[Tensor, "*batch z"],
+        part_of_face: Int[Tensor, "m"] | None = None,
+    ) -> Float[Tensor, "*any out"]:
+        """Outputs for every face; arguments as of `FieldMLP`."""
+        return self.combined(self.functions(features), code, part_of_face)
+
+    def functions(self, features: Float[Tensor, "m f"]) -> Float[Tensor, "m k out"]:
+        """T of every face, for all maps."""
+        return self.of_face(features).unflatten(-1, (self.rank, self.out_features))
+
+    def combined(
+        self,
+        functions: Float[Tensor, "m k out"],
+        code: Float[Tensor, "*batch z"],
+        part_of_face: Int[Tensor, "m"] | None,
+    ) -> Float[Tensor, "*any out"]:
+        """Outputs for every face from T of every face; the rest as for a call."""
+        h = self.of_code(code.reshape(-1, code.shape[-1]))
+        if part_of_face is not None:
+            return torch.einsum("mk,mko->mo", h[part_of_face], functions)
+        outputs = h @ functions.transpose(0, 1).flatten(1)  # (batch, m · out)
+        return outputs.view(*code.shape[:-1], len(functions), self.out_features)
+
+    def on(self, features: Float[Tensor, "m f"]) -> FieldOnFaces:
+        """This field on given faces, of which T is evaluated now, for inference."""
+        return FieldOnFaces(self, features)
+
+
+class FieldOnFaces(nn.Module):
+    """A bilinear field whose functions are known at the faces of one shape.
+
+    Args:
+        field: whose.
+        features: (m, f) of the faces.
+    """
+
+    def __init__(self, field: BilinearField, features: Float[Tensor, "m f"]) -> None:
+        super().__init__()
+        self.field, self.features = field, features
+        with torch.no_grad():
+            self.functions = field.functions(features)
+
+    def forward(
+        self,
+        features: Float[Tensor, "m f"],
+        code: Float[Tensor, "*batch z"],
+        part_of_face: Int[Tensor, "m"] | None = None,
+    ) -> Float[Tensor, "*any out"]:
+        """Outputs for every face.
+
+        Raises:
+            ValueError: other features than those it was made for.
+        """
+        if features is not self.features:
+            raise ValueError("FieldOnFaces: this field is on the faces of another shape")
+        return self.field.combined(self.functions, code, part_of_face)
+
+
+def layered(sizes: tuple[int, ...]) -> nn.Sequential:
+    """Linear layers with the norms and activations of `FieldMLP` between."""
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in itertools.pairwise(sizes[:-1]):
+        layers += [nn.Linear(fan_in, fan_out), nn.GroupNorm(4, fan_out), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))

@@ -96,6 +96,18 @@ def official_loss(
     return _sum(vertices, jacobians)
 
 
+def sampled_loss(
+    predicted: Float[Tensor, "b t k *c"], target: Float[Tensor, "b t k *c"]
+) -> Float[Tensor, ""]:
+    """Mean over cells drawn by area of ‖R - J‖² or ‖Φ - Ψ‖²: a term of `paper_loss` in expectation.
+
+    Args:
+        predicted: of each cell, for t maps of b shapes.
+        target: what it should be.
+    """
+    return (predicted - target).square().flatten(3).sum(-1).mean()
+
+
 def distortion_loss(
     shape: Shape, prediction: Prediction, epsilon: float = 0.1, reduction: Reduction = "mean"
 ) -> Float[Tensor, "*batch"]:

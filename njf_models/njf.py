@@ -7,7 +7,8 @@ and a global step, as in local/global optimisation of a distortion energy (Liu e
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+import copy
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -17,7 +18,8 @@ import diffpoisson as dp
 from diffpoisson.arguments import require_integer
 from njf_models.encoding import CodedModel
 from njf_models.features import Shape
-from njf_models.field import FieldMLP
+from njf_models.field import BilinearField, FieldMLP, FieldOnFaces
+from njf_models.sampled import CellKind, Cells
 
 Centering = Literal["area", "vertex"]
 
@@ -55,7 +57,10 @@ class NeuralJacobianField(CodedModel):
         centering: whether the emitted map has area-weighted mean zero on each component (the
             paper), or its plain mean over vertices is zero (the authors' experiments).
         width: size of the field's hidden layers.
+        rank: make the first field a `field.BilinearField` of that rank; 0 for the paper's MLP.
     """
+
+    samples: ClassVar[CellKind | None] = "faces"
 
     def __init__(
         self,
@@ -71,6 +76,7 @@ class NeuralJacobianField(CodedModel):
         centering: Centering = "area",
         width: int = 128,
         local_step: bool = False,
+        rank: int = 0,
     ) -> None:
         super().__init__(
             point_features,
@@ -86,7 +92,11 @@ class NeuralJacobianField(CodedModel):
         self.output_dim, self.centering = output_dim, centering
         self.rounds, self.shared_rounds, self.local_step = rounds, shared_rounds, local_step
         entries = output_dim * 3
-        self.field = FieldMLP(self.code_size, face_features, entries, width)
+        self.field: FieldMLP | BilinearField | FieldOnFaces
+        if rank:
+            self.field = BilinearField(self.code_size, face_features, entries, width, rank)
+        else:
+            self.field = FieldMLP(self.code_size, face_features, entries, width)
         self.corrections = nn.ModuleList(
             FieldMLP(self.code_size, face_features + (2 + local_step) * entries, entries, width)
             for _ in range(min(rounds - 1, 1) if shared_rounds else rounds - 1)
@@ -101,6 +111,21 @@ class NeuralJacobianField(CodedModel):
                 shapes.
         """
         return self.iterates(shape, code)[-1]
+
+    def on(self, shape: Shape) -> NeuralJacobianField:
+        """A network for inference on this shape alone, for many maps of it.
+
+        What of the field does not depend on the code is evaluated now, once.
+
+        Raises:
+            ValueError: the model's field is not of low rank, so that all of it depends on the code.
+        """
+        if not isinstance(self.field, BilinearField):
+            raise ValueError("NeuralJacobianField.on: this needs a model with rank > 0")
+        model = copy.copy(self)
+        model._modules = dict(self._modules)
+        model.field = self.field.on(shape.features)
+        return model.eval()
 
     def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
         """The maps after each round; arguments as for a call."""
@@ -120,6 +145,31 @@ class NeuralJacobianField(CodedModel):
             offsets = correction(seen, code, part_of_face)
             predictions.append(self._solved(shape, base + self._matrices(offsets)))
         return predictions
+
+    def at(self, cells: Cells, code: Float[Tensor, "b t z"]) -> Float[Tensor, "b t k c 2"]:
+        """The Jacobians R of sampled faces alone, for which nothing is solved.
+
+        Args:
+            cells: faces of b shapes.
+            code: (b, t, z) codes of the maps of each.
+
+        Raises:
+            ValueError: the cells are vertices; or the model has more rounds, which read a solved
+                map.
+        """
+        if self.rounds > 1:
+            raise ValueError(
+                f"NeuralJacobianField.at: samples train a single prediction, not {self.rounds} "
+                "rounds"
+            )
+        if cells.frames is None:
+            raise ValueError("NeuralJacobianField.at: cells must be faces, with their frames")
+        offsets = self.field(cells.features[:, None], code)
+        identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
+        P = (identity + self._matrices(offsets)).to(cells.frames.dtype)
+        # `restrict` has one frame for each face, here of all shapes: (t, b k, c, 3).
+        R = dp.restrict(P.transpose(0, 1).flatten(1, 2), cells.frames.flatten(0, 1))
+        return R.unflatten(1, (len(P), -1)).transpose(0, 1)
 
     def _matrices(self, outputs: Float[Tensor, "*any entries"]) -> Float[Tensor, "*any c 3"]:
         return outputs.unflatten(-1, (self.output_dim, 3))

@@ -28,6 +28,7 @@ class PointNet(nn.Module):
                 layers[f"relu{i + 1}"] = nn.ReLU()
         self.layers = nn.Sequential(layers)
 
-    def forward(self, points: Float[Tensor, "batch s f"]) -> Float[Tensor, "batch z"]:
+    def forward(self, points: Float[Tensor, "*batch s f"]) -> Float[Tensor, "*batch z"]:
         """Code of each point cloud; independent of the order of its points."""
-        return self.layers(points.mT).max(dim=-1).values
+        clouds = points.reshape(-1, *points.shape[-2:])
+        return self.layers(clouds.mT).max(dim=-1).values.unflatten(0, points.shape[:-2])

@@ -6,12 +6,13 @@ import json
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 from torch import Tensor
 
 import diffpoisson as dp
 from njf_models.njf import NeuralJacobianField
+from njf_models.repose_network import ReposeNetwork
 from njf_models.uv_network import UVNetwork
 
 _WEIGHTS = Path(__file__).parent / "weights"
@@ -21,14 +22,28 @@ _ENCODERS = "encoder._DeformationEncoder__module_list."
 _POINTNET = "._PointNetEncoder__pointnet."
 
 
-@cache
-def load_pretrained(name: str = "uv") -> UVNetwork:
+@overload
+def load_pretrained(name: Literal["uv"] = "uv") -> UVNetwork: ...
+@overload
+def load_pretrained(name: Literal["repose"]) -> ReposeNetwork: ...
+@overload
+def load_pretrained(name: str) -> UVNetwork | ReposeNetwork: ...
+def load_pretrained(name: str = "uv") -> UVNetwork | ReposeNetwork:
     """A trained network that comes with this package; `card` says what it was trained on.
+
+    Args:
+        name: "uv", for maps of surfaces to the plane, or "repose", for bodies in other poses.
 
     Raises:
         ValueError: there are no weights of that name.
     """
-    return UVNetwork.load(_file(name, ".safetensors"))
+    return _load(name)
+
+
+@cache
+def _load(name: str) -> UVNetwork | ReposeNetwork:
+    kind = ReposeNetwork if name == "repose" else UVNetwork
+    return kind.load(_file(name, ".safetensors"))
 
 
 def card(name: str = "uv") -> dict[str, Any]:
@@ -50,13 +65,16 @@ def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any
 
     Args:
         mesh: a surface in space, whose components are topological disks unless `cut`.
-        model: the name of trained weights, or a network.
+        model: the name of trained weights for UV maps, or a network.
         options: of `diffpoisson.parameterize`: cut, injective, tolerance, max_iterations.
 
     Raises:
         MeshError: see there.
+        ValueError: there are no weights of that name, or they are not for UV maps.
     """
     network = load_pretrained(model) if isinstance(model, str) else model
+    if not isinstance(network, UVNetwork):
+        raise ValueError(f"parameterize: the weights {model!r} are not for UV maps; use 'uv'")
     return dp.parameterize(mesh, network.start, **options)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning
 import torch
@@ -27,11 +27,13 @@ import diffpoisson as dp
 from njf_models.baselines.cages import CageDeformation
 from njf_models.baselines.diffusion import DiffusionEncodedNJF, DiffusionMap
 from njf_models.baselines.displacement import DisplacementField
+from njf_models.baselines.global_mlp import GlobalMLP
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
-from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss
+from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss, sampled_loss
 from njf_models.metrics import count_flips
 from njf_models.njf import NeuralJacobianField, Prediction
+from njf_models.sampled import Cells
 
 
 @dataclass(frozen=True)
@@ -55,20 +57,22 @@ class Batch:
 
     Attributes:
         shape: the union of the sources, or the one source.
-        points: (sources, s, f) point features of each source.
+        points: (sources, s, f) point features of each source; None for models without an encoder.
         target: (n, c) target images of all vertices, or (t, n, c) of the one source.
         parameters: (t, p) parameters of each of its targets.
+        target_points: (t, s, f) point features of each of them, if the code is made from them.
     """
 
     shape: Shape
-    points: Float[Tensor, "sources s f"]
+    points: Float[Tensor, "sources s f"] | None
     target: Float[Tensor, "*t n c"]
     parameters: Float[Tensor, "*t p"] | None = None
+    target_points: Float[Tensor, "*t s f"] | None = None
 
     @property
     def n_maps(self) -> int:
         """Number of maps."""
-        return len(self.points) if self.target.ndim == 2 else len(self.target)
+        return self.shape.mesh.n_parts if self.target.ndim == 2 else len(self.target)
 
     @classmethod
     def pack(cls, examples: Sequence[Example]) -> Batch:
@@ -87,7 +91,8 @@ class Batch:
         """
         images = motions.images.to(self.target.dtype)[self.shape.mesh.part_of_vertex]
         target = (images @ self.target[..., None])[..., 0]
-        return Batch(self.shape.moved(motions), motions.points(self.points), target)
+        points = None if self.points is None else motions.points(self.points)
+        return Batch(self.shape.moved(motions), points, target)
 
 
 class UVExamples(Dataset[Example]):
@@ -214,12 +219,18 @@ class _Stopwatch:
 
 
 Model = (
-    NeuralJacobianField | DisplacementField | CageDeformation | DiffusionMap | DiffusionEncodedNJF
+    NeuralJacobianField
+    | DisplacementField
+    | CageDeformation
+    | GlobalMLP
+    | DiffusionMap
+    | DiffusionEncodedNJF
 )
 MODELS: dict[str, type[Model]] = {
     "njf": NeuralJacobianField,
     "displacement": DisplacementField,
     "cages": CageDeformation,
+    "global": GlobalMLP,
     "diffusion": DiffusionMap,
     "diffusion+njf": DiffusionEncodedNJF,
 }
@@ -263,14 +274,30 @@ class NJFTraining(lightning.LightningModule):
         self.learning_rate, self.patience, self.steps = learning_rate, patience, steps
         self._wall, self._cpu = _Stopwatch(time.perf_counter), _Stopwatch(time.process_time)
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Loss of one packed batch, averaged over the rounds."""
+    def training_step(self, batch: Batch | Cells, batch_idx: int) -> Tensor:
+        """Loss of one packed batch, averaged over the rounds; or of samples of several shapes."""
+        if isinstance(batch, Cells):
+            return self._sampled_step(batch)
         size = batch.n_maps
         if self.objective.augment:
             batch = batch.moved(Motions.random(size))
         losses = [self.objective(batch, prediction).total for prediction in self._iterates(batch)]
         loss = torch.stack(losses).mean()
         self.log("train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size)
+        return loss
+
+    def _sampled_step(self, cells: Cells) -> Tensor:
+        if self.objective != Objective():
+            raise ValueError(
+                f"NJFTraining: samples are trained by the paper's loss alone, not {self.objective}"
+            )
+        points = cells.points[:, None]  # one cloud for all targets of a shape
+        code = self.model.encode(points, cells.target_points, cells.parameters)
+        loss = sampled_loss(self.model.at(cells, code), cells.target)
+        size = code.shape[:2].numel()
+        self.log(
+            "train/sampled", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=size
+        )
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
@@ -281,13 +308,12 @@ class NJFTraining(lightning.LightningModule):
         values = {f"validation/{name}": value for name, value in loss._asdict().items()}
         if self.model.output_dim == 2:
             J = dp.jacobians(batch.shape.mesh, prediction.vertices)
-            values["validation/flips"] = count_flips(J).float() / size
+            values["validation/flips"] = count_flips(J).sum().float() / size
         self.log("validation/loss", loss.total, prog_bar=True, batch_size=size, sync_dist=True)
         self.log_dict(values, batch_size=size, sync_dist=True)
 
     def _iterates(self, batch: Batch) -> list[Prediction]:
-        code = self.model.encode(batch.points, parameters=batch.parameters)
-        return self.model.iterates(batch.shape, code)
+        return self.model.iterates(batch.shape, encoded(self.model, batch))
 
     @property
     def training_seconds(self) -> float | None:
@@ -332,10 +358,15 @@ class NJFTraining(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     def transfer_batch_to_device(
-        self, batch: Batch, device: torch.device, dataloader_idx: int
-    ) -> Batch:
+        self, batch: Batch | Cells, device: torch.device, dataloader_idx: int
+    ) -> Batch | Cells:
         """The batch as it is: it lives where its factors do."""
         return batch
+
+
+def encoded(model: Model, batch: Batch) -> Float[Tensor, "*t z"]:
+    """The codes of a batch's maps."""
+    return model.encode(batch.points, batch.target_points, batch.parameters)
 
 
 def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Example]:
@@ -399,6 +430,45 @@ class _SaveAtTheEnd(Callback):
 
     def on_train_end(self, trainer: lightning.Trainer, module: lightning.LightningModule) -> None:
         trainer.save_checkpoint(self.path)
+
+
+class Phase(NamedTuple):
+    """A part of a training.
+
+    Attributes:
+        data: what it sees.
+        until: the step at which it ends, counted from the start of the training.
+    """
+
+    data: DataLoader[Any]
+    until: int
+
+
+def fit_phases(
+    module: NJFTraining,
+    folder: Path,
+    phases: Sequence[Phase],
+    validation: DataLoader[Any],
+    *,
+    validate_every: int,
+) -> None:
+    """Train on one kind of batches after another, as one training: one optimizer, one schedule.
+
+    Repeated after an interruption, it goes on from the last checkpoint, in whatever phase that is.
+
+    Args:
+        module: of as many `steps` as the last phase ends at.
+        folder: for logs and checkpoints, as of `make_trainer`.
+        phases: in their order.
+        validation: what every phase is validated on.
+        validate_every: so many steps; the best checkpoint is the best of those.
+    """
+    for phase in phases:
+        checkpoint = last_checkpoint(folder)
+        done = torch.load(checkpoint, weights_only=False)["global_step"] if checkpoint else 0
+        if done < phase.until:
+            trainer = make_trainer(folder, steps=phase.until, validate_every=validate_every)
+            trainer.fit(module, phase.data, validation, ckpt_path=checkpoint)
 
 
 def last_checkpoint(folder: Path) -> Path | None:

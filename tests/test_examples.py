@@ -11,7 +11,10 @@ import pytest
 import torch
 import trimesh
 
+import diffpoisson as dp
 from njf_models.datasets.bodies import BodyStore
+from njf_models.meshfiles import read_mesh_file
+from njf_models.repose_network import ReposeNetwork
 from tests import meshes
 
 ROOT = Path(__file__).parent.parent
@@ -32,15 +35,29 @@ def test_uv_train(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_repose_and_triangulations(tmp_path):
-    """Both models learn, on bodies that are nowhere twice; then their maps on other meshes."""
-    main = runpy.run_path(str(ROOT / "examples" / "repose.py"))["main"]
+def test_bodies(tmp_path):
+    """Models learn, on bodies that are nowhere twice; other tasks; other meshes; other bodies."""
+    main = runpy.run_path(str(ROOT / "examples" / "body_maps.py"))["main"]
     sizes = ["--bodies", "3", "--poses", "4", "--held-out", "2", "--faces", "600"]
     model = ["--code-size", "16", "--points", "32", "--energies", "0", "--targets", "4"]
-    table = main([*sizes, *model, "--steps", "60", "--out", str(tmp_path)])
+    table = main(
+        [
+            *sizes,
+            *model,
+            "--steps",
+            "60",
+            "--per-step",
+            "2",
+            "--cells",
+            "60",
+            "--out",
+            str(tmp_path),
+        ]
+    )
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["summary"] == table
-    assert results["training"]["ours"]["steps"] == 60
+    assert sum(results["training"]["ours"]["steps"].values()) == 60
+    assert set(results["training"]["cages"]["steps"]) == {"whole"}
     for name in ("ours", "displacement", "cages"):
         assert table[name]["maps"] == 2 * 4
         assert table[name]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
@@ -50,12 +67,44 @@ def test_repose_and_triangulations(tmp_path):
     assert len(set(phenotypes)) == 3 + 2 + 2
     assert (tmp_path / "results.png").stat().st_size > 50_000
 
+    for task in ("any-pose", "registration", "morphing"):
+        out, data = tmp_path / task, tmp_path / "bodies"
+        common = [*sizes, *model, "--steps", "20", "--sources", "2", "--models", "njf"]
+        common += ["--validations", "2"]
+        common += ["--init", str(tmp_path)] if task == "any-pose" else []
+        table = main([*common, "--task", task, "--out", str(out), "--data", str(data)])
+        assert table["ours"]["maps"] == 2 * 2 * (4 if task == "morphing" else 3)
+        assert 0 < table["ours"]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
+        assert (out / "results.png").stat().st_size > 50_000
+
     main = runpy.run_path(str(ROOT / "examples" / "triangulations.py"))["main"]
     deviations = main(["--run", str(tmp_path), "--bodies", "1", "--poses", "2"])["ours"]
     assert deviations["trained on"].deviation < 1e-6
     assert deviations["original"].n_faces == 26692
     for name in ("original", "Loop-subdivided", "four times as many"):
         assert 0 < deviations[name].share < 0.2
+
+    # Bodies unlike those of training, by the same network.
+    main = runpy.run_path(str(ROOT / "examples" / "far_body.py"))["main"]
+    out = tmp_path / "far"
+    common = ["--run", str(tmp_path), "--out", str(out), "--poses", "2"]
+    table = main(common)
+    assert set(table) == {"a test body", "a child", "a tall body", "very heavy"}
+    assert all(row["maps"] == 2 and 0 < row["L2-V"] < 60 for row in table.values())
+    assert json.loads((out / "far.json").read_text()) == table
+    # A file whose y is up, twice as large, is the same character as the test body it was made from.
+    body = kept["test"][0]
+    x, y, z = 2 * body.rest.double().T
+    lines = [f"v {a} {b} {c}" for a, b, c in torch.stack([x, z, -y], 1).tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (body.faces + 1).tolist()]
+    (tmp_path / "own.obj").write_text("\n".join(lines))
+    height = float(z.max() - z.min()) / 2
+    main([*common, "--mesh", str(tmp_path / "own.obj"), "--y-up", "--height", str(height)])
+    network = ReposeNetwork.from_checkpoint(tmp_path / "njf" / "checkpoints" / "best.ckpt")
+    expected = network.repose(dp.Mesh(body.rest.double(), body.faces), body.poses[:1])[0]
+    x, y, z = torch.from_numpy(read_mesh_file(out / "far.obj").vertices).T / 2
+    written = torch.stack([x, -z, y], dim=1)
+    assert torch.cdist(written, expected).amin(1).max() < 1e-3
 
 
 def test_fit_source(tmp_path):
@@ -94,6 +143,53 @@ def test_texel_density(tmp_path):
     assert results["ratio"][-1] > 1.4
     assert results["flips"][-1] == 0
     assert (tmp_path / "density.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
+def test_arap(tmp_path):
+    """Both models train, though too little to do well; the solver is timed, and converges."""
+    main = runpy.run_path(str(ROOT / "examples" / "arap.py"))["main"]
+    sizes = ["--edge", "0.2", "--maps", "16", "--held-out", "3", "--timed", "1"]
+    table = main([*sizes, "--minutes", "0.1", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["summary"] == table
+    for name in ("ours", "global MLP"):
+        assert table[name]["maps"] == 3
+        assert table[name]["L2-J"] < 1.2 * table["untrained"]["L2-J"]
+        assert table[name]["L2-J"] != table["untrained"]["L2-J"]
+        assert results["training"][name]["cpu seconds"] > 0
+        assert table[f"{name}, pinned"]["L2-J"] == table[name]["L2-J"]  # that before the solve
+        assert table[f"{name}, pinned"]["L2-V"] < table[name]["L2-V"]
+    solver = results["solver"]
+    assert solver["largest residual"] <= 1e-6
+    assert solver["iterations accelerated, mean"] < solver["iterations as it comes, mean"]
+    assert (tmp_path / "results.png").stat().st_size > 50_000
+
+
+@pytest.mark.slow
+def test_contact(tmp_path):
+    """Both models come nearer to states of unseen trajectories than the block at rest is."""
+    main = runpy.run_path(str(ROOT / "examples" / "contact.py"))["main"]
+    sizes = ["--columns", "12", "--trajectories", "6", "--held-out", "3", "--minutes", "0.1"]
+    table = main([*sizes, "--out", str(tmp_path)])
+    assert json.loads((tmp_path / "results.json").read_text())["summary"] == table
+    for name in ("ours", "offsets"):
+        assert table[name]["maps"] == 12
+        assert table[name]["L2-V"] < table["untrained"]["L2-V"]
+        assert table[name]["L2-V after the steps"] < table["untrained"]["L2-V after the steps"]
+    assert (tmp_path / "results.png").stat().st_size > 50_000
+
+
+def test_deform(tmp_path):
+    """By Jacobians the same loss leads nearer to the map that made the cloud, and smoothly."""
+    main = runpy.run_path(str(ROOT / "examples" / "deform.py"))["main"]
+    size = ["--edge", "0.4", "--steps", "30", "--points", "300"]
+    results = main([*size, "--out", str(tmp_path)])
+    start, ours, theirs = (results[name] for name in ("start", "by Jacobians", "by vertices"))
+    assert ours["distance of the cloud"] < 0.5 * start["distance of the cloud"]
+    assert ours["error of vertices"] < 0.8 * theirs["error of vertices"]
+    assert ours["angle of normals"] < 0.5 * theirs["angle of normals"]
+    assert (tmp_path / "deform.png").stat().st_size > 20_000
 
 
 def test_tables_are_those_of_the_results():

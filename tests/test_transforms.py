@@ -152,6 +152,48 @@ def _(dtype: torch.dtype, device: str) -> Layer:
     return poisson(mesh, dp.PoissonSolver(mesh, gauge="vertex"), gauge="vertex")
 
 
+def polar(J: Tensor) -> Tensor:
+    """The rotation closest to matrices of positive determinant, by Newton's iteration."""
+    for _ in range(12):
+        J = (J + torch.linalg.inv(J).mT) / 2
+    return J
+
+
+@layer("closest rotation")
+def _(dtype: torch.dtype, device: str) -> Layer:
+
+    def near(x: Tensor) -> Tensor:  # the identity, whatever x is, so that nothing is flipped
+        return torch.eye(3).to(x) + x.sin() / 5
+
+    x = values(3, 3, 3).to(dtype).to(device)
+    return Layer(lambda x: dp.closest_rotation(near(x)), lambda x: polar(near(x)), x)
+
+
+@layer("as rigid as possible")
+def _(dtype: torch.dtype, device: str) -> Layer:
+    """Two steps from a start, by the start."""
+    mesh = mesh_of(meshes.box(0, 2), dtype, device)
+    pins, q = [0, 3, 5, 6], values(4, 3) / 5
+    solver = dp.PoissonSolver(mesh, pins=torch.tensor(pins, device=device))
+    vertices, faces = geometry(mesh)
+    G = references.hat_gradient_matrix(vertices, faces).view(mesh.n_faces, 3, -1)
+    q = q + vertices[pins]
+
+    def function(x: Tensor) -> Tensor:
+        options = {"pins": q.to(x), "tolerance": None, "max_steps": 2}
+        start = vertices.to(x) + x.sin() / 10
+        return dp.as_rigid_as_possible(solver, start=start, **options).vertices
+
+    def reference(x: Tensor) -> Tensor:
+        phi = vertices + x.sin() / 10
+        for _ in range(2):
+            R = polar((G @ phi).mT)
+            phi = references.constrained_poisson(vertices, faces, R, pins=(pins, q))
+        return phi
+
+    return Layer(function, reference, values(8, 3, seed=1).to(dtype).to(device))
+
+
 PINS, HANDLES = [3, 0], [4, 2]
 
 

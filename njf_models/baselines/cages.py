@@ -14,6 +14,7 @@ from njf_models.encoding import CodedModel
 from njf_models.features import Shape, vertex_features
 from njf_models.field import FieldMLP
 from njf_models.njf import Centering, Prediction, centre_areas, centre_vertices
+from njf_models.sampled import WholeShapes
 
 
 class _Cage(NamedTuple):
@@ -28,7 +29,7 @@ class _Cage(NamedTuple):
     weights: Float[Tensor, "n k"]
 
 
-class CageDeformation(CodedModel):
+class CageDeformation(WholeShapes, CodedModel):
     """Φ = V + W D: vertices follow, by mean-value coordinates W, a cage moved by D.
 
     The cage of a shape is its offset surface, decimated; Neural Cages also learn the cage. D is

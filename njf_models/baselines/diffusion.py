@@ -10,27 +10,28 @@ import diffpoisson as dp
 from njf_models.diffusion_net import DiffusionNet
 from njf_models.features import Shape
 from njf_models.njf import NeuralJacobianField, Prediction, centre_areas
+from njf_models.sampled import WholeShapes
 
 
-class _Uncoded(nn.Module):
+class _Uncoded(WholeShapes, nn.Module):
     """A model that learns of the whole shape by diffusion, and needs no code."""
 
     output_dim: int
 
     def encode(
         self,
-        source: Float[Tensor, "batch s f"],
+        source: Float[Tensor, "batch s f"] | None = None,
         target: Float[Tensor, "batch t f"] | None = None,
         parameters: Float[Tensor, "batch p"] | None = None,
     ) -> Float[Tensor, "batch 0"]:
-        """Nothing, for each source.
+        """Nothing, for each source; for one if there are none.
 
         Raises:
             ValueError: targets or parameters, which the model would not see.
         """
         if target is not None or parameters is not None:
             raise ValueError(f"{type(self).__name__}: maps of the source alone, without parameters")
-        return source.new_zeros(len(source), 0)
+        return torch.zeros(1, 0) if source is None else source.new_zeros(len(source), 0)
 
     def forward(self, shape: Shape, code: Float[Tensor, "*batch 0"]) -> Prediction:
         """The map of a shape."""

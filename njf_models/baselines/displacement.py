@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,6 +12,7 @@ from njf_models.encoding import CodedModel
 from njf_models.features import Shape
 from njf_models.field import FieldMLP
 from njf_models.njf import Centering, Prediction, centre_areas, centre_vertices
+from njf_models.sampled import CellKind, Cells
 
 
 class DisplacementField(CodedModel):
@@ -25,6 +28,8 @@ class DisplacementField(CodedModel):
         centering: see `NeuralJacobianField`.
         width: size of the hidden layers.
     """
+
+    samples: ClassVar[CellKind | None] = "vertices"
 
     def __init__(
         self,
@@ -59,6 +64,16 @@ class DisplacementField(CodedModel):
         phi = (centre_areas if self.centering == "area" else centre_vertices)(shape, phi)
         J = dp.jacobians(mesh, phi)
         return Prediction(dp.extend(J, shape.frames), J, phi)
+
+    def at(self, cells: Cells, code: Float[Tensor, "b t z"]) -> Float[Tensor, "b t k c"]:
+        """The images of sampled vertices alone, before the map is centred.
+
+        Args:
+            cells: vertices of b shapes.
+            code: (b, t, z) codes of the maps of each.
+        """
+        features = cells.features[:, None]
+        return features[..., : self.output_dim] + self.field(features, code)
 
     def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
         """The one map; for training as of a model with rounds."""

@@ -115,9 +115,11 @@ def run(options: argparse.Namespace) -> int:
 def _begin_with(model: nn.Module, arguments: dict[str, Any], weights: str) -> None:
     """Load weights that are known by name or in a file."""
     from njf_models.pretrained import load_pretrained  # noqa: PLC0415
+    from njf_models.repose_network import ReposeNetwork  # noqa: PLC0415
     from njf_models.uv_network import UVNetwork  # noqa: PLC0415
 
     path = Path(weights)
+    network: UVNetwork | ReposeNetwork
     if path.suffix == ".ckpt":
         network = UVNetwork.from_checkpoint(path)
     else:

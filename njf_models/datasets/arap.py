@@ -15,7 +15,7 @@ from pathlib import Path
 import igl
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 from torch import Tensor
@@ -178,6 +178,17 @@ class ArapMaps:
     def parameters(self) -> Float[Tensor, "k p"]:
         """(k, 3h) what a network is told: the handles' positions, from rest, in units of reach."""
         return self.offsets.flatten(1) / self.settings.reach
+
+    @property
+    def held(self) -> Bool[Tensor, "b"]:
+        """Which vertices of the surface some handle holds."""
+        return torch.from_numpy(self.solid.handle_of[self.solid.surface] >= 0)
+
+    def held_positions(self, index: int) -> Float[Tensor, "p 3"]:
+        """Where these are in one of the maps, float64."""
+        at = self.solid.surface[self.held.numpy()]
+        moved = self.offsets[index].double()[torch.from_numpy(self.solid.handle_of[at])]
+        return torch.from_numpy(self.solid.vertices[at]) + moved
 
 
 def draw_offsets(settings: ArapSettings, number: int, n_handles: int) -> Float[np.ndarray, "h 3"]:

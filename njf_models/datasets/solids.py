@@ -10,8 +10,9 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -25,12 +26,13 @@ Points = Float[np.ndarray, "n 3"]
 
 # Joints and radii of the trunk, the neck and the tail; and of a leg and an arm, of which each is
 # there twice. In metres; x to the front, z up, y = 0 the plane of symmetry.
-_MIDDLE: list[tuple[list[tuple[float, float, float]], list[float]]] = [
-    ([(-0.25, 0, 0.62), (0.15, 0, 0.66)], [0.15, 0.13]),
-    ([(0.15, 0, 0.66), (0.38, 0, 0.88), (0.58, 0, 0.90)], [0.11, 0.07, 0.06]),
-    ([(-0.25, 0, 0.62), (-0.6, 0, 0.58), (-0.95, 0, 0.66)], [0.12, 0.07, 0.035]),
+_Limb = tuple[list[tuple[float, ...]], list[float]]
+_MIDDLE: list[_Limb] = [
+    ([(-0.25, 0.0, 0.62), (0.15, 0.0, 0.66)], [0.15, 0.13]),
+    ([(0.15, 0.0, 0.66), (0.38, 0.0, 0.88), (0.58, 0.0, 0.90)], [0.11, 0.07, 0.06]),
+    ([(-0.25, 0.0, 0.62), (-0.6, 0.0, 0.58), (-0.95, 0.0, 0.66)], [0.12, 0.07, 0.035]),
 ]
-_SIDES: list[tuple[list[tuple[float, float, float]], list[float]]] = [
+_SIDES: list[_Limb] = [
     (
         [(-0.12, 0.1, 0.56), (0.02, 0.16, 0.34), (-0.1, 0.16, 0.12), (0.02, 0.18, 0.05)],
         [0.11, 0.07, 0.045, 0.045],
@@ -180,7 +182,7 @@ def lizard_surface() -> tuple[Points, Int[np.ndarray, "m 3"]]:
     )
 
 
-def _limb(joints: Sequence[tuple[float, float, float]], radii: Sequence[float]) -> Any:
+def _limb(joints: Sequence[tuple[float, ...]], radii: Sequence[float]) -> Any:
     """Balls at the joints, and the convex hull of each with the next."""
     from manifold3d import Manifold  # noqa: PLC0415
 
@@ -196,7 +198,7 @@ def _limb(joints: Sequence[tuple[float, float, float]], radii: Sequence[float]) 
 
 def tetrahedralise(
     vertices: Points, faces: Int[np.ndarray, "m 3"], edge: float, tolerance: float = 2e-3
-) -> tuple[Points, Int[np.ndarray, "t 4"]]:
+) -> tuple[Float[np.ndarray, "p 3"], Int[np.ndarray, "t 4"]]:
     """Tetrahedra inside of a closed surface, by fTetWild; all of positive volume.
 
     Args:
@@ -211,7 +213,8 @@ def tetrahedralise(
     _require("wildmeshing")
     import wildmeshing  # noqa: PLC0415  (only where data is made)
 
-    with _silenced():
+    # It writes files to the working folder.
+    with _silenced(), tempfile.TemporaryDirectory() as folder, chdir(folder):
         mesher = wildmeshing.Tetrahedralizer(edge_length_r=edge, epsilon=tolerance, max_threads=1)
         mesher.set_log_level(6)
         mesher.set_mesh(vertices, faces.astype(np.int32))

@@ -109,18 +109,18 @@ def fit(module: TimedTraining, examples: UVExamples, seconds: float) -> None:
     trainer.fit(module, loader(examples, 8, shuffle=True))
 
 
-def figures(module: TimedTraining, examples: UVExamples) -> dict[str, float]:
-    """Of the validation patches."""
+def figures(module: TimedTraining, examples: UVExamples) -> dict[str, float | None]:
+    """Of the validation patches; None for infinity, which JSON lacks."""
     records, _ = evaluate_uv(module.model, examples)
     raw, emitted = (np.array([getattr(r, n) for r in records]) for n in ("flips_raw", "flips"))
-    excess = np.array([r.energy / r.slim_energy for r in records])
+    median = float(np.median([r.energy / r.slim_energy for r in records]))
     return {
         "steps": module.global_step,
         "patches": len(records),
         "patches with a flip, raw, %": 100 * float((raw > 0).mean()),
         "flips per patch, raw": float(raw.mean()),
         "patches with a flip, %": 100 * float((emitted > 0).mean()),
-        "energy over SLIM's, median": float(np.median(excess)),
+        "energy over SLIM's, median": median if median < math.inf else None,
         "L2-J, median": float(np.median([r.l2_j for r in records])),
     }
 

@@ -40,7 +40,7 @@ CODED = {"face_features": 6, "point_features": 6, "code_size": 256}
 SIGNED = {"face_features": 56, "point_features": 56, "code_size": 256}
 CONTESTANTS = {
     "NJF of the paper: PointNet and WKS, 1 round": Contestant("njf", SIGNED, PAPER, wks=True),
-    "DiffusionNet predicts UVs": Contestant("diffusion", {"features": 6, "width": 128}, PAPER),
+    "DiffusionNet predicts UVs": Contestant("diffusion", {"features": 6}, PAPER),
     "NJF with DiffusionNet as encoder, 1 round": Contestant(
         "diffusion+njf", {"features": 6}, PAPER
     ),
@@ -51,7 +51,7 @@ CONTESTANTS = {
 }
 
 
-def measure(module: TimedTraining, examples: UVExamples) -> dict[str, float]:
+def measure(module: TimedTraining, examples: UVExamples) -> dict[str, float | None]:
     """Those of the ablation, and the faces that the paper counts in this comparison."""
     records, _ = evaluate_uv(module.model, examples)
     return figures(module, examples) | {

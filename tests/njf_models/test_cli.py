@@ -64,7 +64,7 @@ def test_help_lists_the_commands(capsys):
     assert "exit codes: 0 all went well" in text
 
 
-@pytest.mark.parametrize("command", ["uv", "info"])
+@pytest.mark.parametrize("command", ["uv", "info", "repose"])
 def test_help_of_a_command_has_examples_that_parse(command, capsys):
     from njf_models.cli import parser
 
@@ -77,7 +77,8 @@ def test_help_of_a_command_has_examples_that_parse(command, capsys):
 
 
 @pytest.mark.parametrize(
-    ("command", "page", "count"), [("uv", "cli.md", 6), ("data", "data.md", 3)]
+    ("command", "page", "count"),
+    [("uv", "cli.md", 6), ("repose", "cli.md", 9), ("data", "data.md", 3)],
 )
 def test_the_page_of_the_docs_agrees_with_the_parser(command, page, count):
     """Its examples parse, and it knows every option."""

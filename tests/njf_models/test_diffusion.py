@@ -12,8 +12,7 @@ from torch.testing import assert_close
 import diffpoisson as dp
 from njf_models import Shape
 from njf_models.baselines.diffusion import DiffusionEncodedNJF, DiffusionMap
-from njf_models.diffusion_net import DiffusionBlock, DiffusionNet, vertex_gradients
-from njf_models.features import Motions
+from njf_models.diffusion_net import DiffusionBlock, DiffusionNet
 from njf_models.spectrum import Spectrum
 from njf_models.training import MODELS, NJFTraining
 from tests import references
@@ -63,14 +62,12 @@ def test_the_unit_of_length_drops_out():
     assert_close(a.values, b.values, rtol=1e-5, atol=1e-4)
     u = torch.randn(mesh.n_vertices, 1)
     assert_close(a.diffused(u, torch.tensor([0.1])), b.diffused(u, torch.tensor([0.1])))
-    shapes = [Shape.prepare(m, n_eigenpairs=K) for m in (mesh, large)]
-    assert_close(*(vertex_gradients(shape, u) for shape in shapes), rtol=1e-4, atol=1e-4)
+    assert_close(a.gradients(u), b.gradients(u), rtol=1e-4, atol=1e-4)
 
 
 def test_gradients_of_linear_functions_are_their_tangent_parts():
     """On a flat piece exactly; the mean over faces of the projected constant elsewhere."""
     mesh = bumpy_disk()
-    shape = prepared(mesh)
     vertices, faces = unit(mesh)
     g = np.array([0.3, -1.0, 2.0])
     u = torch.from_numpy(vertices @ g)[:, None]
@@ -83,7 +80,7 @@ def test_gradients_of_linear_functions_are_their_tangent_parts():
     for k in range(3):
         np.add.at(expected, faces[:, k], areas[:, None] * projected)
         np.add.at(total, faces[:, k], areas)
-    actual = vertex_gradients(shape, u)[..., 0].numpy()
+    actual = Spectrum.of(mesh, K).gradients(u)[..., 0].numpy().T
     assert_close(actual, expected / total[:, None], rtol=1e-9, atol=1e-9)
 
 
@@ -95,8 +92,9 @@ def test_block_is_the_published_formula():
     u = torch.randn(mesh.n_vertices, 5, dtype=torch.float64)
     spectrum = shape.spectra[0]
     spread = spectrum.diffused(u, block.log_times.exp())
-    gradients = vertex_gradients(shape, spread).detach().numpy()  # (n, 3, w)
-    normals = shape.vertex_features[:, 3:6].numpy()
+    gradients = spectrum.gradients(spread).detach().numpy().swapaxes(0, 1)  # (n, 3, w)
+    normals = spectrum.normals.double().numpy()
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     x = np.cross(normals, np.random.default_rng(0).normal(size=3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(normals, x)
@@ -117,17 +115,18 @@ def test_frames_of_the_faces_do_not_matter():
     assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
-def test_a_block_knows_no_pose():
-    shape = prepared(bumpy_disk())
-    block = lively_block()
-    u = torch.randn(shape.mesh.n_vertices, 5, dtype=torch.float64)
+def test_a_block_knows_no_pose_but_orientation():
+    """The imaginary part of A turns with the faces' orientation; a mirror keeps their order."""
+    mesh, block = bumpy_disk(), lively_block()
+    u = torch.randn(mesh.n_vertices, 5, dtype=torch.float64)
     turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))[0]
-    turn *= torch.linalg.det(turn)  # a rotation: the imaginary part sees a mirror
-    motion = Motions(turn[None], torch.eye(2)[None], torch.tensor([1.0]))
-    expected = block(shape, u)
-    assert_close(block(shape.moved(motion), u), expected, rtol=1e-9, atol=1e-9)
-    mirror = Motions(-turn[None], torch.eye(2)[None], torch.tensor([1.0]))
-    assert not torch.allclose(block(shape.moved(mirror), u), expected, atol=1e-3)
+    turn *= torch.linalg.det(turn)
+    expected = block(prepared(mesh), u)
+    for matrix in (turn, -turn):
+        moved = dp.Mesh(mesh.vertices @ matrix.T, mesh.faces)
+        assert_close(block(prepared(moved), u), expected, rtol=1e-4, atol=1e-4)
+    inverted = dp.Mesh(mesh.vertices, mesh.faces.flip(1))
+    assert not torch.allclose(block(prepared(inverted), u), expected, atol=1e-2)
 
 
 @pytest.mark.parametrize("kind", [DiffusionMap, DiffusionEncodedNJF])

@@ -1,4 +1,4 @@
-"""The field MLP and PointNet against the plain modules they stand for."""
+"""The fields and PointNet against the plain modules or sums that they stand for."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from njf_models.field import FieldMLP
+from njf_models import NeuralJacobianField, Shape
+from njf_models.field import BilinearField, FieldMLP
 from njf_models.pointnet import PointNet
-from tests.njf_models.shapes import randomised
+from tests.njf_models.shapes import bumpy_disk, ellipsoid, prepared, randomised
 
 
 def plain_field(model: FieldMLP) -> nn.Sequential:
@@ -122,3 +123,52 @@ def test_pointnet_norms_act_over_the_channels_of_a_group_and_all_points():
 @pytest.mark.parametrize("code_size", [8, 1000])
 def test_pointnet_code_size(code_size):
     assert PointNet(6, code_size)(torch.randn(1, 10, 6)).shape == (1, code_size)
+
+
+def bilinear(**options):
+    return randomised(BilinearField(5, 6, width=8, rank=7, **options))
+
+
+def test_a_bilinear_field_is_a_sum_of_products():
+    """By hand, for codes of any batch; and for the parts of a packed batch."""
+    field, features = bilinear(), torch.randn(11, 6, dtype=torch.float64)
+    code = torch.randn(2, 3, 5, dtype=torch.float64)
+    functions = field.of_face(features).view(11, 7, 9)
+    expected = torch.zeros(2, 3, 11, 9, dtype=torch.float64)
+    for k in range(7):
+        h = field.of_code(code.view(6, 5))[:, k].view(2, 3, 1, 1)
+        expected = expected + h * functions[:, k]
+    assert_close(field(features, code), expected, rtol=1e-9, atol=1e-9)
+    assert_close(field(features, code[0, 0]), expected[0, 0], rtol=1e-9, atol=1e-9)
+    part = torch.arange(11) % 3
+    packed = field(features, code[0], part)
+    assert_close(packed, expected[0, part, torch.arange(11)], rtol=1e-9, atol=1e-9)
+
+
+def test_a_bilinear_field_starts_at_the_identity_and_learns():
+    mesh = ellipsoid()
+    shape = prepared(mesh)
+    model = NeuralJacobianField(6, 0, parameters=5, rank=7).double()
+    code = torch.randn(3, 5, dtype=torch.float64)
+    prediction = model(shape, code)
+    assert_close(prediction.jacobians, mesh.frames.expand(3, -1, -1, -1), rtol=0, atol=1e-12)
+    prediction.vertices.square().sum().backward()
+    assert model.field.of_face[-1].weight.grad.abs().max() > 0
+    union = Shape.concatenate([shape, prepared(bumpy_disk())])
+    packed = randomised(model)(union, code[:2])
+    alone = model(shape, code[0]).vertices
+    assert_close(union.mesh.split_vertices(packed.vertices)[0], alone, rtol=1e-9, atol=1e-9)
+
+
+def test_a_network_on_one_shape():
+    """The same maps; the network itself stays what it is, and other shapes are refused."""
+    shape, other = prepared(ellipsoid()), prepared(ellipsoid(1))
+    model = randomised(NeuralJacobianField(6, 0, parameters=5, rank=7))
+    fixed, code = model.on(shape), torch.randn(2, 5, dtype=torch.float64)
+    assert_close(fixed(shape, code).vertices, model(shape, code).vertices, rtol=1e-12, atol=1e-12)
+    assert isinstance(model.field, BilinearField)
+    model(other, code)
+    with pytest.raises(ValueError, match="the faces of another shape"):
+        fixed(other, code)
+    with pytest.raises(ValueError, match="rank > 0"):
+        NeuralJacobianField(6, 0, parameters=5).on(shape)

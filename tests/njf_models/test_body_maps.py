@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import igl
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -9,10 +11,10 @@ from torch.testing import assert_close
 
 import diffpoisson as dp
 from njf_models import NeuralJacobianField
+from njf_models.body_maps import BodyMaps, Task, body_loader, evaluate_maps, summarise
 from njf_models.body_report import BodyRow, render_body, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body
 from njf_models.losses import paper_loss
-from njf_models.reposing import PoseExamples, body_loader, evaluate_reposing, summarise
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 from tests import meshes
 
@@ -40,7 +42,7 @@ def bodies():
 
 
 def test_a_batch_is_one_shape_and_targets_with_their_parameters(bodies):
-    batch = PoseExamples(bodies, n_targets=3, n_energies=8, n_points=20)[1]
+    batch = BodyMaps(bodies, n_targets=3, n_energies=8, n_points=20)[1]
     assert batch.n_maps == 3
     assert batch.shape.mesh.n_parts == 1
     assert batch.points.shape == (1, 20, 6 + 8)
@@ -51,8 +53,8 @@ def test_a_batch_is_one_shape_and_targets_with_their_parameters(bodies):
 
 def test_training_sees_all_poses_in_turn_and_evaluation_always_the_same(bodies):
     fixed, fresh = (
-        PoseExamples(bodies, **INPUTS),
-        PoseExamples(bodies, n_targets=2, resample=True, **INPUTS),
+        BodyMaps(bodies, **INPUTS),
+        BodyMaps(bodies, n_targets=2, resample=True, **INPUTS),
     )
     assert_close(fixed[0].points, fixed[0].points)
     assert (fresh[0].points - fresh[0].points).abs().max() > 0
@@ -68,7 +70,7 @@ def test_training_sees_all_poses_in_turn_and_evaluation_always_the_same(bodies):
 
 
 def test_any_pose_can_be_the_source_of_the_others(bodies):
-    examples = PoseExamples(bodies, sources=2, **INPUTS)
+    examples = BodyMaps(bodies, Task(sources=2), **INPUTS)
     assert len(examples) == 2 * len(bodies)
     for index in range(len(examples)):
         body, source = bodies[index // 2], index % 2
@@ -77,14 +79,91 @@ def test_any_pose_can_be_the_source_of_the_others(bodies):
         others = [pose for pose in range(5) if pose != source]
         assert (batch.target == body.posed[others]).all()
         assert (batch.parameters == body.poses[others]).all()
-    records, maps = evaluate_reposing(NeuralJacobianField(**MODEL), examples)
+    records, maps = evaluate_maps(NeuralJacobianField(**MODEL), examples)
     assert [(r.source, r.pose) for r in records[:5]] == [(0, 1), (0, 2), (0, 3), (0, 4), (1, 0)]
     assert [len(of_source) for of_source in maps] == [4] * 8
 
 
+def distances(points, vertices, faces):
+    """Squared distance of point features' positions to a surface, both as features have it."""
+    x = vertices.double()
+    x = x - (x.amax(0) + x.amin(0)) / 2
+    return igl.point_mesh_squared_distance(
+        points[:, :3].double().numpy(), x.numpy(), faces.numpy()
+    )[0]
+
+
+def test_registration_maps_what_is_left_of_a_body_onto_points_of_all_of_another_pose(bodies):
+    task = Task(sources=2, told="points", pieces=2, radii=(0.4, 0.5))
+    maps = BodyMaps(bodies, task, **INPUTS)
+    for index in (0, 3):
+        source, batch = maps.source(index), maps[index]
+        body = bodies[index // 2]
+        kept, mesh = source.kept, batch.shape.mesh
+        assert 10 < mesh.n_vertices < len(body.rest)
+        assert_close(mesh.vertices.float(), body.posed[index % 2][kept])
+        assert batch.parameters is None
+        targets = maps.targets(index).tolist()
+        assert [b for b, _ in targets] == [index // 2] * 4
+        for (_, pose), target, points in zip(
+            targets, batch.target, batch.target_points, strict=True
+        ):
+            assert pose != index % 2
+            assert (target == body.posed[pose][kept]).all()
+            assert distances(points, body.posed[pose], body.faces).max() < 1e-10
+        assert distances(batch.points[0], mesh.vertices, mesh.faces).max() < 1e-10
+        again = maps[index]
+        assert (again.target_points == batch.target_points).all()
+        assert (again.points == batch.points).all()
+    fresh = BodyMaps(bodies, task, resample=True, **INPUTS)
+    assert len({len(fresh.source(0).kept) for _ in range(20)}) > 1  # cut anew each time
+
+
+def test_morphing_maps_to_other_bodies_in_any_pose(bodies):
+    maps = BodyMaps(bodies, Task(sources=3, told="points", others=True), n_targets=3, **INPUTS)
+    seen = set()
+    for index in range(len(maps)):
+        batch, targets = maps[index], maps.targets(index)
+        assert torch.equal(targets, maps.targets(index))
+        for (body, pose), target in zip(targets.tolist(), batch.target, strict=True):
+            assert body != index // 3
+            assert (target == bodies[body].posed[pose]).all()
+            seen.add((body, pose))
+    assert len(seen) > 10
+    model = NeuralJacobianField(6, 6, encodes_target=True, code_size=16)
+    records, _ = evaluate_maps(model, maps)
+    assert [(r.target, r.pose) for r in records[:3]] == [tuple(t) for t in maps.targets(0).tolist()]
+    with pytest.raises(ValueError, match="two of them at least"):
+        BodyMaps(bodies[:1], Task(others=True))
+
+
+@pytest.mark.parametrize("told", ["pose", "points"])
+def test_cells_are_of_the_maps_of_a_batch(bodies, told):
+    """Whose targets have the Jacobians, and whose vertices the images, that cells are told."""
+    maps = BodyMaps(bodies, Task(sources=2, told=told), **INPUTS)
+    batch = maps[1]
+    mesh, J = batch.shape.mesh, dp.jacobians(batch.shape.mesh, batch.target)
+    faces = maps.cells(1, "faces", 50)
+    chosen = torch.cdist(faces.features.double(), batch.shape.features.double()).argmin(1)
+    assert_close(faces.features, batch.shape.features[chosen])
+    assert_close(faces.target, J[:, chosen])
+    assert_close(faces.frames, batch.shape.frames[chosen])
+    vertices = maps.cells(1, "vertices", 50)
+    chosen = torch.cdist(vertices.features.double(), batch.shape.vertex_features.double()).argmin(1)
+    weights = (mesh.vertex_areas / mesh.vertex_areas.sum()).float()
+    centred = batch.target - (weights[:, None] * batch.target).sum(1, keepdim=True)
+    assert_close(vertices.target, centred[:, chosen], rtol=1e-5, atol=1e-6)
+    for cells in (faces, vertices):
+        assert_close(cells.points, batch.points[0])
+        if told == "pose":
+            assert (cells.parameters == batch.parameters).all()
+        else:
+            assert (cells.target_points == batch.target_points).all()
+
+
 @pytest.mark.parametrize("kind", ["njf", "displacement", "cages"])
 def test_a_batch_has_the_loss_and_gradient_of_the_mean_over_its_targets(bodies, kind):
-    batch = PoseExamples(bodies, **INPUTS)[0]
+    batch = BodyMaps(bodies, **INPUTS)[0]
     model = NJFTraining(MODEL, kind=kind).model
     torch.nn.init.normal_(model.field.layers[-1].weight, std=0.1)
 
@@ -114,38 +193,38 @@ def test_training_learns_the_twist_and_resumes(bodies, tmp_path, kind):
 
     def fit(steps):
         torch.manual_seed(0)
-        module = NJFTraining(MODEL, learning_rate=3e-3, steps=60, kind=kind)
+        module = NJFTraining(MODEL, learning_rate=3e-3, steps=90, kind=kind)
         trainer = make_trainer(tmp_path, steps=steps, validate_every=30)
         trainer.fit(
             module,
-            body_loader(PoseExamples(train, resample=True, **INPUTS), shuffle=True),
-            body_loader(PoseExamples(validation, **INPUTS)),
+            body_loader(BodyMaps(train, resample=True, **INPUTS), shuffle=True),
+            body_loader(BodyMaps(validation, **INPUTS)),
             ckpt_path=last_checkpoint(tmp_path),
         )
         return trainer
 
-    fit(30)
-    assert fit(60).global_step == 60
+    fit(45)
+    assert fit(90).global_step == 90
     path = last_checkpoint(tmp_path)
     model = load_checkpoint(path)
     assert type(model) is type(NJFTraining(MODEL, kind=kind).model)
     saved = torch.load(path, weights_only=False)
     assert saved["cpu_seconds"] > 0
-    examples = PoseExamples(train, **INPUTS)
-    untrained = summarise(evaluate_reposing(NeuralJacobianField(**MODEL), examples)[0])
-    trained = summarise(evaluate_reposing(model, examples)[0])
+    examples = BodyMaps(train, **INPUTS)
+    untrained = summarise(evaluate_maps(NeuralJacobianField(**MODEL), examples)[0])
+    trained = summarise(evaluate_maps(model, examples)[0])
     for error in ("L2-V", "L2-J", "L2-N, degrees"):
         assert trained[error] < 0.9 * untrained[error]
 
 
 def test_records_of_a_known_map(bodies):
     """A network that outputs twice a quarter turn: every error can be computed by hand."""
-    examples = PoseExamples(bodies[:2], **INPUTS)
+    examples = BodyMaps(bodies[:2], **INPUTS)
     model = NeuralJacobianField(**MODEL)
     turn = 2 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     with torch.no_grad():
         model.field.layers[-1].bias.copy_((turn - torch.eye(3)).flatten())
-    records, maps = evaluate_reposing(model, examples)
+    records, maps = evaluate_maps(model, examples)
     assert [(r.body, r.pose) for r in records] == [(b, p) for b in (0, 1) for p in range(5)]
     assert {record.source for record in records} == {None}
     record, body = records[7], bodies[1]
@@ -197,3 +276,13 @@ def test_report_is_written(bodies, tmp_path):
     rows = [BodyRow("first", body.faces, body.rest, body.posed[0], predictions)]
     save_body_report(rows, tmp_path / "report.png", size=80)
     assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_without_targets_maps_are_drawn_plain(bodies, tmp_path):
+    """Source and map, two panels, and no scale of errors."""
+    body, sizes = bodies[0], []
+    for target in (None, body.posed[0]):
+        rows = [BodyRow("first", body.faces, body.rest, target, {"ours": body.posed[0]})]
+        save_body_report(rows, tmp_path / "report.png", size=80)
+        sizes.append(plt.imread(tmp_path / "report.png").shape[1])
+    assert 1.4 * sizes[0] < sizes[1]

@@ -1,0 +1,259 @@
+"""Learn volumetric as-rigid-as-possible deformation from six handles: a field beside a global MLP.
+
+A lizard is generated, filled with tetrahedra and deformed by ARAP to convergence, many times, with
+its handles (head, end of the tail, feet, hands) moved at random. A Neural Jacobian Field learns how
+its surface deforms; all that it is told are the positions of the handles. "Ours" is a field of few
+functions on the surface with coefficients from a network of the code; the paper's is an MLP of each
+face and the code. The baseline, an MLP that emits the Jacobians of all faces at once, has the same
+data and loss, and the same CPU time. All are evaluated on positions that were never seen, as they
+come and with the handles pinned in the Poisson solve, and timed against the solver.
+
+The default takes about ten minutes on two cores; `--full` is the experiment of docs/elastic.md and
+takes an hour and more. Run it again after an interruption, and it goes on where it stopped. The
+paper's Raptor is not free: compare ratios with its figures, not errors.
+
+Writes to the folder `--out`: results.png, results.json, the solid, its deformations, training logs
+and checkpoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import platform
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+
+import diffpoisson as dp
+from njf_models.body_report import BodyRow, save_body_report
+from njf_models.budget import planned_steps
+from njf_models.datasets.arap import (
+    ArapMaps,
+    ArapSettings,
+    ArapSolver,
+    build_arap,
+    draw_offsets,
+    load_solid,
+    save_solid,
+)
+from njf_models.datasets.solids import Solid, lizard
+from njf_models.elastic_maps import (
+    ElasticBatches,
+    ElasticRecord,
+    elastic_loader,
+    evaluate_elastic,
+    summarise,
+)
+from njf_models.evaluation import format_table
+from njf_models.features import Shape
+from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
+
+KINDS = {"njf": "ours", "field": "the paper's field", "global": "global MLP"}  # in tables
+SEEDS = {"train": 0, "validation": 1, "test": 2}
+N_VALIDATIONS = 10
+
+
+def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
+    options = parse(argv)
+    options.out.mkdir(parents=True, exist_ok=True)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
+    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+
+    solid = make_solid(options)
+    maps = make_maps(solid, options)
+    shape = Shape.prepare(dp.Mesh(solid.vertices[solid.surface], solid.faces))
+    records, images, costs = {}, {}, {}
+    for kind in options.models:
+        title = KINDS[kind]
+        steps = plan(kind, maps["train"], shape, options)
+        checkpoint = fit(kind, steps, maps, shape, options)
+        costs[title] = {"steps": steps, **cost(checkpoint)}
+        model = load_checkpoint(checkpoint)
+        for pinned in (False, True):
+            of_model = evaluate_elastic(model, maps["test"], shape, pinned=pinned)
+            name = f"{title}, pinned" if pinned else title
+            records[name], images[name] = of_model
+
+    table = {"untrained": summarise(unmoved(maps["test"], shape, options))}
+    table |= {title: summarise(of_model) for title, of_model in records.items()}
+    solver = time_solver(solid, maps["test"], options)
+    print("\nUnseen positions of the handles:\n" + format_table(table))
+    print("\nThe solver:\n" + "\n".join(f"{name}: {value:.4g}" for name, value in solver.items()))
+    results = {
+        "options": {
+            name: value for name, value in vars(options).items() if not isinstance(value, Path)
+        },
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "training": costs,
+        "solver": solver,
+        "summary": table,
+    }
+    (options.out / "results.json").write_text(json.dumps(results, indent=1))
+    draw(options.out / "results.png", shape, maps["test"], images, records)
+    print(f"\n{options.out / 'results.png'}  {options.out / 'results.json'}")
+    return table
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--out", type=Path, default=Path("runs/arap"), help="folder for results (runs/arap)")
+    add("--data", type=Path, help="folder of the maps, for several runs to share (OUT/data)")
+    add("--edge", type=float, default=0.035, help="length of edges over the size (0.035)")
+    add("--maps", type=int, default=1000, metavar="N", help="to learn from (1000)")
+    add("--held-out", type=int, default=100, metavar="N", help="to validate, and to test (100)")
+    add("--minutes", type=float, default=2, help="of CPU time for each model (2)")
+    add("--rank", type=int, default=64, help="of our field (64)")
+    add("--global-width", type=int, default=512, help="of the global MLP's (512)")
+    add("--timed", type=int, default=3, metavar="N", help="test maps to time the solver on (3)")
+    add("--models", nargs="+", choices=KINDS, default=["njf", "global"], help="to train")
+    add("--full", action="store_true", help="4000 maps, 200 held out, all models, 12 minutes each")
+    add("--seed", type=int, default=0, help="of the weights and batches")
+    options = parser.parse_args(argv)
+    if options.full:
+        parser.set_defaults(maps=4000, held_out=200, minutes=12, timed=10, models=list(KINDS))
+        options = parser.parse_args(argv)
+    options.data = options.data or options.out / "data"
+    return options
+
+
+def make_solid(options: argparse.Namespace) -> Solid:
+    """The lizard; the same one in all runs that share their data."""
+    path = options.data / "solid.safetensors"
+    if not path.exists():
+        save_solid(path, lizard(options.edge))
+    return load_solid(path)
+
+
+def make_maps(solid: Solid, options: argparse.Namespace) -> dict[str, ArapMaps]:
+    """Training, validation and test maps: of different seeds, so apart in handle positions."""
+    return {
+        name: build_arap(
+            options.data / name,
+            options.maps if name == "train" else options.held_out,
+            solid,
+            ArapSettings(seed=seed),
+        )
+        for name, seed in SEEDS.items()
+    }
+
+
+def batches(kind: str, maps: ArapMaps, shape: Shape) -> ElasticBatches:
+    """What a model learns from; the global one can't make use of a few faces alone."""
+    if kind == "njf":  # in which a map more costs little
+        options = {"n_targets": 16, "n_faces": 256, "n_sampled_targets": 128}
+        return ElasticBatches(maps, shape, sampled=64, shuffle=True, **options)
+    if kind == "field":
+        return ElasticBatches(maps, shape, sampled=64, shuffle=True)
+    return ElasticBatches(maps, shape, n_targets=32, shuffle=True)
+
+
+def make_module(kind: str, steps: int, shape: Shape, options: argparse.Namespace) -> NJFTraining:
+    lightning.seed_everything(options.seed, verbose=False)
+    model = {"parameters": 18}
+    if kind == "global":
+        model |= {"n_faces": shape.mesh.n_faces, "width": options.global_width}
+        return NJFTraining(model, steps=steps, kind=kind)
+    model |= {"face_features": 6, "point_features": 0}
+    model |= {"rank": options.rank} if kind == "njf" else {}
+    return NJFTraining(model, steps=steps)
+
+
+def plan(kind: str, train: ArapMaps, shape: Shape, options: argparse.Namespace) -> int:
+    """Steps that take the wanted CPU time, a multiple of the validations: one follows the last."""
+    data, path = batches(kind, train, shape), options.out / f"{kind}-steps.json"
+    turns = [data[i] for i in range(data.period)]
+    return planned_steps(
+        path, make_module(kind, 1, shape, options), turns, options.minutes, N_VALIDATIONS
+    )
+
+
+def fit(
+    kind: str, steps: int, maps: dict[str, ArapMaps], shape: Shape, options: argparse.Namespace
+) -> Path:
+    """Train, going on from the last checkpoint if there is one; the best by validation loss."""
+    folder = options.out / kind
+    trainer = make_trainer(folder, steps=steps, validate_every=steps // N_VALIDATIONS)
+    trainer.fit(
+        make_module(kind, steps, shape, options),
+        elastic_loader(batches(kind, maps["train"], shape)),
+        elastic_loader(ElasticBatches(maps["validation"], shape, n_targets=20)),
+        ckpt_path=last_checkpoint(folder),
+    )
+    return folder / "checkpoints" / "best.ckpt"
+
+
+def cost(checkpoint: Path) -> dict[str, float | None]:
+    """What the training until the last step took."""
+    last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
+    return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
+
+
+def unmoved(test: ArapMaps, shape: Shape, options: argparse.Namespace) -> list[ElasticRecord]:
+    """Errors of the identity map, which an untrained model is."""
+    return evaluate_elastic(make_module("njf", 1, shape, options).model, test, shape)[0]
+
+
+def time_solver(solid: Solid, test: ArapMaps, options: argparse.Namespace) -> dict[str, float]:
+    """How libigl's ARAP converged on the test maps, and what some of them take again.
+
+    Without acceleration, as it comes, and with it, as the data was made; both to the tolerance of
+    the data.
+    """
+    result = {
+        "tetrahedra": len(solid.tetrahedra),
+        "largest residual": float(test.residuals.max()),
+        "iterations, mean": float(test.iterations.float().mean()),
+        "flipped tetrahedra, mean": float(test.flips.float().mean()),
+        "flipped tetrahedra, most": float(test.flips.max()),
+    }
+    for name, memory in (("as it comes", 0), ("accelerated", 6)):
+        solver = ArapSolver(solid, memory=memory, tolerance=test.settings.tolerance)
+        seconds, iterations = [], []
+        for number in range(min(options.timed, len(test))):
+            start = time.process_time()
+            iterations.append(
+                solver(draw_offsets(test.settings, number, solid.n_handles)).iterations
+            )
+            seconds.append(time.process_time() - start)
+        result[f"iterations {name}, mean"] = float(np.mean(iterations))
+        result[f"CPU seconds {name}, median"] = float(np.median(seconds))
+    return result
+
+
+def draw(
+    path: Path,
+    shape: Shape,
+    test: ArapMaps,
+    images: dict[str, torch.Tensor],
+    records: dict[str, list[ElasticRecord]],
+) -> None:
+    """Draw the test maps at three percentiles of the first model's error, chosen by nothing else.
+
+    That is our model, unless it was left out.
+    """
+    first = next(iter(records.values()))
+    order = np.argsort([record.l2_v for record in first])
+    rows = []
+    for percentile in (10, 50, 90):
+        at = int(order[round(percentile / 100 * (len(order) - 1))])
+        errors = ", ".join(f"{of_model[at].l2_v:.2f}" for of_model in records.values())
+        title = f"test map {at}: {percentile}th percentile\nL2-V {errors}"
+        predictions: dict[str, Any] = {name: of_model[at] for name, of_model in images.items()}
+        mesh = shape.mesh
+        rows.append(BodyRow(title, mesh.faces, mesh.vertices, test.positions[at], predictions))
+    save_body_report(rows, path, limit=0.05)
+
+
+if __name__ == "__main__":
+    main()

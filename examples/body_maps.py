@@ -1,0 +1,307 @@
+"""Maps between human bodies: a Neural Jacobian Field beside baselines, on four tasks.
+
+`--task repose`: from the rest pose to pose parameters; `any-pose`: from any pose to pose
+parameters; `registration`: a body with pieces cut away onto points of the same body in another
+pose; `morphing`: a body in any pose onto points of another body in any pose.
+
+Random bodies → poses inside joint limits → training → evaluation on bodies and poses that were
+never seen. Training has two phases, one optimizer and one schedule: first on random faces of
+several bodies a step, by the Jacobian loss alone, which needs no solve; then on one whole body a
+step, by the paper's loss on Jacobians and solved map. The displacement field, a baseline, is
+trained on random vertices first; Neural Cages on whole bodies throughout, for their cages are
+small. All have the same data, code and CPU time.
+
+The default takes about fifteen minutes of CPU time, and a minute or two more when the body model
+is built for the first time; `--full` has the paper's code and points, and takes days on a CPU. Run
+it again after an interruption, and it goes on where it stopped. The paper's bodies, STAR, are
+licensed and can't be had here: compare ratios with its figures, not errors.
+
+Writes to the folder `--out`: results.png, results.json, maps.json (the errors of each test map),
+the bodies, training logs and checkpoints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import platform
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+
+from njf_models.body_maps import (
+    TASKS,
+    BodyCells,
+    BodyMaps,
+    MapRecord,
+    body_loader,
+    cell_loader,
+    evaluate_maps,
+    summarise,
+)
+from njf_models.body_report import BodyRow, save_body_report
+from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
+from njf_models.evaluation import format_table
+from njf_models.training import MODELS, NJFTraining, Phase, fit_phases, load_checkpoint
+
+KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
+PAPER = {"bodies": 2000, "poses": 32, "code_size": 1000, "points": 1024, "targets": 32}
+LEARNING_RATE = 2e-3
+
+
+def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
+    options = parse(argv)
+    options.out.mkdir(parents=True, exist_ok=True)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
+    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+
+    train, validation, test = make_bodies(options)
+    steps = plan(train, options)
+    records, maps, costs = {}, {}, {}
+    for kind in options.models:
+        title = KINDS[kind]
+        checkpoint = fit(kind, steps[kind], train, validation, options)
+        costs[title] = {"steps": steps[kind], **cost(checkpoint)}
+        records[title], maps[title] = evaluate_maps(
+            load_checkpoint(checkpoint), maps_of(test, options)
+        )
+
+    table = {"untrained": summarise(unmoved(options, test))}
+    table |= {title: summarise(of_model) for title, of_model in records.items()}
+    print("\nUnseen bodies and poses:\n" + format_table(table))
+    results = {
+        "options": {
+            name: value for name, value in vars(options).items() if not isinstance(value, Path)
+        },
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "training": costs,
+        "summary": table,
+    }
+    (options.out / "results.json").write_text(json.dumps(results, indent=1))
+    every = {title: [asdict(record) for record in of_model] for title, of_model in records.items()}
+    (options.out / "maps.json").write_text(json.dumps(every))
+    draw(options.out / "results.png", maps_of(test, options), maps, records)
+    print(f"\n{options.out / 'results.png'}  {options.out / 'results.json'}")
+    return table
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--task", choices=TASKS, default="repose", help="which maps (repose)")
+    add("--out", type=Path, help="folder for results (runs/TASK)")
+    add("--data", type=Path, help="folder of the bodies, for several runs to share (OUT/bodies)")
+    add("--bodies", type=int, default=64, metavar="N", help="training identities (64)")
+    add("--poses", type=int, default=16, metavar="N", help="of each (16)")
+    add("--held-out", type=int, default=16, metavar="N", help="test identities (16)")
+    add("--faces", type=int, default=2500, help="of the triangulation (2500)")
+    add("--sources", type=int, metavar="N", help="poses of a body that are sources (the task's)")
+    add("--targets", type=int, default=8, metavar="N", help="of a source per step (8)")
+    add("--steps", type=int, default=3000, help="of the Neural Jacobian Field (3000)")
+    add(
+        "--whole", type=float, default=0.13, metavar="X", help="share of whole bodies' steps (0.13)"
+    )
+    add("--per-step", type=int, default=8, metavar="N", help="bodies per sampled step (8)")
+    add("--cells", type=int, default=100, metavar="N", help="sampled of each (100)")
+    add("--code-size", type=int, default=256, help="of PointNet's code (256)")
+    add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
+    add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
+    add("--models", nargs="+", choices=KINDS, default=list(KINDS), help="which to train (all)")
+    add("--validations", type=int, default=10, metavar="N", help="in a training (10)")
+    add("--init", type=Path, metavar="RUN", help="begin with the networks of another folder")
+    add("--full", action="store_true", help=f"the paper's scale: {PAPER}, 200,000 steps")
+    add("--seed", type=int, default=0)
+    options = parser.parse_args(argv)
+    if options.full:
+        parser.set_defaults(**PAPER, steps=200_000)
+        options = parser.parse_args(argv)
+    options.out = options.out or Path("runs") / options.task
+    options.data = options.data or options.out / "bodies"
+    return options
+
+
+def make_bodies(options: argparse.Namespace) -> list[BodyStore]:
+    """Training, validation and test bodies: of different seeds, so apart in bodies and poses."""
+    sizes = {"train": options.bodies, "validation": options.held_out, "test": options.held_out}
+    return [
+        build_bodies(
+            options.data / name,
+            size,
+            options.faces,
+            BodySettings(seed=3 * options.seed + i, n_poses=options.poses),
+        )
+        for i, (name, size) in enumerate(sizes.items())
+    ]
+
+
+def inputs(options: argparse.Namespace) -> dict[str, int]:
+    """What the networks see."""
+    return {"n_points": options.points, "n_energies": options.energies}
+
+
+def maps_of(
+    bodies: BodyStore | list[Body], options: argparse.Namespace, *, training: bool = False
+) -> BodyMaps:
+    """Maps to learn or to evaluate."""
+    task = TASKS[options.task]
+    if options.sources is not None:
+        task = replace(task, sources=options.sources)
+    if training and task.sources:
+        task = replace(task, sources=options.poses)  # all of them
+    n_targets = options.targets if training else options.poses
+    return BodyMaps(bodies, task, n_targets=n_targets, resample=training, **inputs(options))
+
+
+def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraining:
+    lightning.seed_everything(options.seed, verbose=False)
+    n_features = 6 + options.energies
+    model = {
+        "face_features": n_features,
+        "point_features": n_features,
+        "code_size": options.code_size,
+    }
+    if TASKS[options.task].told == "pose":
+        model["parameters"] = POSE_SIZE
+    else:
+        model["encodes_target"] = True
+    return NJFTraining(
+        model, learning_rate=LEARNING_RATE, steps=steps, inputs=inputs(options), kind=kind
+    )
+
+
+def loaders(kind: str, train: BodyStore, options: argparse.Namespace) -> dict[str, DataLoader[Any]]:
+    """What each phase of a training sees."""
+    maps = maps_of(train, options, training=True)
+    phases: dict[str, DataLoader[Any]] = {}
+    samples = MODELS[kind].samples
+    if samples is not None:
+        phases["sampled"] = cell_loader(BodyCells(maps, samples, options.cells), options.per_step)
+    return phases | {"whole": body_loader(maps, shuffle=True)}
+
+
+def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, dict[str, int]]:
+    """Steps of each phase of each model, at equal CPU time; decided once for a folder of results.
+
+    The time of a phase that a model does without is added to the other.
+    """
+    path = options.out / "steps.json"
+    steps = json.loads(path.read_text()) if path.exists() else {}
+    if missing := [kind for kind in options.models if kind not in steps]:
+        shares = {"sampled": 1 - options.whole, "whole": options.whole}
+        ours = seconds_per_step("njf", train, options)
+        seconds = {phase: options.steps * share * ours[phase] for phase, share in shares.items()}
+        for kind in missing:
+            each = ours if kind == "njf" else seconds_per_step(kind, train, options)
+            left = sum(seconds[phase] for phase in seconds if phase not in each)
+            n = {phase: round(seconds[phase] / second) for phase, second in each.items()}
+            n["whole"] += round(left / each["whole"])
+            n["whole"] += (
+                -sum(n.values()) % options.validations
+            )  # so that one follows the last step
+            steps[kind] = n
+        path.write_text(json.dumps(steps))
+    return steps
+
+
+def seconds_per_step(kind: str, train: BodyStore, options: argparse.Namespace) -> dict[str, float]:
+    """CPU time of a step of each phase, the median of some."""
+    module = make_module(kind, 1, options)
+    optimizer = torch.optim.Adam(module.parameters())
+    seconds = {}
+    for phase, loader in loaders(kind, train, options).items():
+        times = []
+        batches: Iterator[Any] = iter(cycle(loader))
+        for _ in range(11):
+            start = time.process_time()
+            optimizer.zero_grad()
+            module.training_step(next(batches), 0).backward()
+            optimizer.step()
+            times.append(time.process_time() - start)
+        seconds[phase] = float(np.median(times))
+    return seconds
+
+
+def fit(
+    kind: str,
+    steps: dict[str, int],
+    train: BodyStore,
+    validation: BodyStore,
+    options: argparse.Namespace,
+) -> Path:
+    """Train, going on from the last checkpoint if there is one; the best by validation loss."""
+    module = make_module(kind, sum(steps.values()), options)
+    if options.init is not None:
+        other = load_checkpoint(options.init / kind / "checkpoints" / "best.ckpt")
+        module.model.load_state_dict(other.state_dict())
+    ends = dict(zip(steps, np.cumsum(list(steps.values())).tolist(), strict=True))
+    total = ends["whole"]
+    fit_phases(
+        module,
+        options.out / kind,
+        [Phase(data, ends[phase]) for phase, data in loaders(kind, train, options).items()],
+        body_loader(maps_of(validation, options)),
+        validate_every=total // options.validations,
+    )
+    return options.out / kind / "checkpoints" / "best.ckpt"
+
+
+def cost(checkpoint: Path) -> dict[str, float | None]:
+    """What the training until the last step took."""
+    last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
+    return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
+
+
+def unmoved(options: argparse.Namespace, test: BodyStore) -> list[MapRecord]:
+    """Errors of the identity map, which an untrained model is."""
+    model = make_module("njf", 1, options).model
+    return evaluate_maps(model, maps_of(test, options))[0]
+
+
+def draw(
+    path: Path,
+    examples: BodyMaps,
+    maps: dict[str, list[torch.Tensor]],
+    records: dict[str, list[MapRecord]],
+) -> None:
+    """Draw the test maps at three percentiles of the first model's error, chosen by nothing else.
+
+    That is our model, unless it was left out.
+    """
+    images = {
+        name: [phi for source in of_model for phi in source] for name, of_model in maps.items()
+    }
+    first = next(iter(records.values()))
+    places = [(i, k) for i in range(len(examples)) for k in range(len(examples.targets(i)))]
+    order = np.argsort([record.l2_v for record in first])
+    rows = []
+    for percentile in (10, 50, 90):
+        at = int(order[round(percentile / 100 * (len(order) - 1))])
+        (index, k), record = places[at], first[at]
+        source, target = examples.source(index), examples[index].target[k]
+        errors = ", ".join(f"{of_model[at].l2_v:.2f}" for of_model in records.values())
+        other = f" of body {record.target}" if record.target != record.body else ""
+        title = (
+            f"body {record.body}, pose {record.pose}{other}: {percentile}th percentile\n"
+            f"L2-V {errors}"
+        )
+        predictions = {name: of_model[at] for name, of_model in images.items()}
+        mesh = source.mesh
+        rows.append(BodyRow(title, mesh.faces, mesh.vertices.float(), target, predictions))
+    save_body_report(rows, path)
+
+
+if __name__ == "__main__":
+    main()

@@ -68,7 +68,7 @@ def flatten_disk(
     if stages.flips:
         # Deep surfaces shrink exponentially in an embedding, which SLIM may not undo; the harmonic
         # map, with the flips out of it, is closer to an isometry, and worth some patience.
-        stages.run("untangle", lambda uv: untangle(mesh, uv, max_rounds=40)[0])
+        stages.run("untangle", lambda uv: untangle(mesh, uv, max_rounds=100)[0])
         if stages.flips or not stages.simple:
             stages.start("tutte", lambda: tutte(mesh))
     return stages.polished(injective=injective, **polish)

@@ -542,9 +542,9 @@ PAPER = [
         5.67,
         158.7,
         "DiffusionNet",
-        "uv",
-        ("all", None),
-        _PATCHES,
+        "uv_diffusion",
+        ("NJF of the paper: PointNet and WKS, 1 round", "DiffusionNet predicts UVs"),
+        "validation patches of other meshes",
     ),
     Row(
         "re-posing from rest",
@@ -622,15 +622,18 @@ def counterpart(row: Row) -> list[str]:
     if row.result is None or not path.exists():
         return ["not yet", "not yet" if row.baseline else "–", "–", "–"]
     results = json.loads(path.read_text())
-    summary = results.get("summary") or results["raw"]
+    summary = results.get("summary") or results.get("raw") or results["models"]
     ours, theirs = row.columns
+    if ours not in summary:
+        return ["not yet", "not yet", "–", "–"]
     cells = ratio(summary[ours][row.quantity], None)
     if theirs in summary:
         cells = ratio(summary[ours][row.quantity], summary[theirs][row.quantity])
     elif row.baseline:
         cells[1] = "not yet"
     cost = results.get("training", {}).get(ours, {}).get("cpu seconds")
-    return [*cells, "–" if cost is None else number(cost / 60)]
+    minutes = results.get("minutes") if cost is None else cost / 60
+    return [*cells, "–" if minutes is None else number(minutes)]
 
 
 def data_cost() -> str:

@@ -280,7 +280,8 @@ def test_an_interrupt_from_the_terminal_is_resumed(tmp_path: Path, moment: str) 
     error = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     assert "Traceback" not in error
-    assert error.strip().split("\n")[-1] == "njf data: interrupted"
+    # Loky's tracker of resources, a process of its own, may warn of what is gone, after all else.
+    assert "njf data: interrupted" in error.splitlines()
     assert not list(shards.glob(".*.tmp"))
     for folder in ("store", "whole"):
         resumed = ["data", str(tmp_path / folder), *small, "--backend", "sequential"]

@@ -10,6 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson.certificate import count_flips, is_simple
+from diffpoisson.distortion import flipped
+from diffpoisson.gradient import jacobians
 from diffpoisson.mesh import Mesh
 from diffpoisson.parameterization import SlimResult, harmonic_disk, slim, tutte
 from diffpoisson.poisson import PoissonSolver
@@ -86,8 +88,9 @@ class _Stages:
 
     @property
     def flips(self) -> bool:
-        """Whether the map has a triangle that is not positively oriented."""
-        return count_flips(self.mesh, self.uv) > 0
+        """Whether a triangle is not positively oriented, exactly or to the rounding of SLIM's start."""
+        exactly = count_flips(self.mesh, self.uv) > 0
+        return exactly or bool(flipped(jacobians(self.mesh, self.uv)).any())
 
     @property
     def simple(self) -> bool:

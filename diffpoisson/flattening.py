@@ -88,7 +88,7 @@ class _Stages:
 
     @property
     def flips(self) -> bool:
-        """Whether a triangle is not positively oriented, exactly or to the rounding of SLIM's start."""
+        """Whether a triangle is not positively oriented, exactly or as SLIM will round it."""
         exactly = count_flips(self.mesh, self.uv) > 0
         return exactly or bool(flipped(jacobians(self.mesh, self.uv)).any())
 

@@ -52,7 +52,8 @@ from njf_models.body_maps import (
 from njf_models.body_report import BodyRow, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
 from njf_models.evaluation import format_table
-from njf_models.training import MODELS, NJFTraining, Phase, fit_phases, load_checkpoint
+from njf_models.models import MODELS
+from njf_models.training import NJFTraining, Phase, fit_phases, load_checkpoint
 
 KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
 PAPER = {"bodies": 2000, "poses": 32, "code_size": 1000, "points": 1024, "targets": 32}

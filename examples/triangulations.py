@@ -21,8 +21,8 @@ import torch
 from njf_models.agnosticism import Deviation, compare_triangulations
 from njf_models.datasets.bodies import Body, BodyModel, BodyStore
 from njf_models.datasets.triangulation import Triangulation
+from njf_models.trained import Inputs
 from njf_models.training import NJFTraining
-from njf_models.uv_network import Inputs
 
 KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
 

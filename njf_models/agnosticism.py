@@ -13,8 +13,9 @@ import diffpoisson as dp
 from njf_models.body_maps import BodyMaps
 from njf_models.datasets.bodies import Body, BodyModel, retriangulated
 from njf_models.datasets.triangulation import Triangulation
-from njf_models.training import Model, encoded
-from njf_models.uv_network import Inputs
+from njf_models.models import Model
+from njf_models.trained import Inputs
+from njf_models.training import encoded
 
 
 @dataclass(frozen=True)

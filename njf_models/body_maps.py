@@ -18,9 +18,10 @@ from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.datasets.partial import Partial, cut_pieces
 from njf_models.features import Shape, point_features
 from njf_models.metrics import l2_jacobians, l2_normals, l2_vertices
+from njf_models.models import Model
 from njf_models.njf import Prediction
 from njf_models.sampled import CellKind, Cells
-from njf_models.training import Batch, Model, encoded
+from njf_models.training import Batch, encoded
 
 _KEPT_SOURCES = 512  # each half a megabyte, and some of them with a factor
 

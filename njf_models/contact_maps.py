@@ -16,7 +16,7 @@ import diffpoisson as dp
 from njf_models.datasets.contact import ContactMaps, ContactSolver, Scene
 from njf_models.features import Shape
 from njf_models.metrics import l2_jacobians, l2_vertices
-from njf_models.training import Model
+from njf_models.models import Model
 
 MARGIN = 0.005  # by how much a step moves what intersects past the place where it touches
 MAX_STEPS = 20

@@ -19,7 +19,7 @@ class DiffusionBlock(nn.Module):
 
     Gradient features of the diffused channels are tanh(Re(conj z ⊙ A z)), where z are their
     gradients in the tangent plane as complex numbers and A is a learned complex matrix. On vectors
-    in space, with the normal n, that is tanh(z · (A' z) + z · (n × A'' z)), and needs no basis.
+    in space, with the normal n, that is tanh(z · (A' z) + n · (A'' z × z)), and needs no basis.
 
     Args:
         width: number of channels.
@@ -48,10 +48,17 @@ class DiffusionBlock(nn.Module):
         """The diffused channels of one shape, and their gradient features."""
         spread = spectrum.diffused(u, times)
         z = spectrum.gradients(spread)
-        turned = torch.linalg.cross(
-            spectrum.normals.to(u.dtype).T[..., None].expand_as(z), self.imaginary(z), dim=0
-        )
-        return spread, torch.tanh((z * (self.real(z) + turned)).sum(0))
+        turned = _triple_product(spectrum.normals.to(u.dtype).T[..., None], self.imaginary(z), z)
+        return spread, torch.tanh((z * self.real(z)).sum(0) + turned)
+
+
+def _triple_product(
+    n: Float[Tensor, "3 n 1"], a: Float[Tensor, "3 n w"], b: Float[Tensor, "3 n w"]
+) -> Float[Tensor, "n w"]:
+    """n · (a × b), a few times faster than `torch.linalg.cross`."""
+    cyclic = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+    terms = [n[i] * (a[j] * b[k] - a[k] * b[j]) for i, j, k in cyclic]
+    return terms[0] + terms[1] + terms[2]
 
 
 class DiffusionNet(nn.Module):

@@ -18,8 +18,9 @@ from njf_models.datasets.arap import ArapMaps
 from njf_models.datasets.contact import ContactMaps
 from njf_models.features import Shape
 from njf_models.metrics import l2_jacobians, l2_normals, l2_vertices
+from njf_models.models import Model
 from njf_models.njf import Prediction
-from njf_models.training import Batch, Model
+from njf_models.training import Batch
 
 
 class ElasticBatches(Dataset[Batch]):

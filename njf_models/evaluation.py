@@ -15,8 +15,9 @@ import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
 from njf_models.losses import paper_loss
 from njf_models.metrics import count_distorted, count_flips, l2_jacobians, l2_vertices
+from njf_models.models import Model
 from njf_models.njf import Prediction
-from njf_models.training import Batch, Model, UVExamples
+from njf_models.training import Batch, UVExamples
 
 
 @dataclass(frozen=True)

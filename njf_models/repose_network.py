@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import diffpoisson as dp
-from njf_models.features import Shape, point_features
-from njf_models.njf import NeuralJacobianField
-from njf_models.uv_network import Inputs
+from njf_models.features import Shape
+from njf_models.trained import TrainedNetwork
 
 
 class Stance(NamedTuple):
@@ -60,20 +54,10 @@ class PreparedBody(NamedTuple):
     centre: Float[Tensor, "3"]
 
 
-class ReposeNetwork:
-    """A network for the maps of bodies from rest to poses, and how its inputs are made.
+class ReposeNetwork(TrainedNetwork):
+    """A network for the maps of bodies from rest to poses, with the poses as parameters."""
 
-    Args:
-        arguments: of the model, a `NeuralJacobianField` with pose parameters.
-        inputs: what it sees.
-
-    Attributes:
-        model: the network.
-    """
-
-    def __init__(self, arguments: dict[str, Any], inputs: Inputs) -> None:
-        self.arguments, self.inputs = arguments, inputs
-        self.model = NeuralJacobianField(**arguments).eval()
+    holds: ClassVar[str] = "repose_network"
 
     def repose(self, mesh: dp.Mesh, poses: Float[Tensor, "p k"]) -> Float[Tensor, "p n 3"]:
         """A body in other poses.
@@ -91,14 +75,9 @@ class ReposeNetwork:
     def prepare(self, mesh: dp.Mesh) -> PreparedBody:
         """What depends on the body alone: factor, features and points."""
         mesh = mesh.to(torch.float64)
-        solver, wks = dp.PoissonSolver(mesh), None
-        if self.inputs.n_energies:
-            wks = dp.wave_kernel_signature(mesh, self.inputs.n_energies, solver=solver)
-        generator = torch.Generator().manual_seed(0)  # the same map at every call
-        samples = dp.sample_surface(mesh, self.inputs.n_points, generator=generator)
-        points = point_features(mesh, samples, wks).float()
+        shape, points = self.inputs.of(mesh)
         centre = mesh.vertex_areas @ mesh.vertices / mesh.areas.sum()
-        return PreparedBody(Shape.prepare(mesh, wks, solver=solver), points, centre)
+        return PreparedBody(shape, points, centre)
 
     @torch.no_grad()
     def repose_prepared(
@@ -107,37 +86,3 @@ class ReposeNetwork:
         """A body that was prepared before, in other poses; float64."""
         code = self.model.encode(body.points[None], parameters=poses.float())
         return self.model(body.shape, code).vertices.double() + body.centre
-
-    # ---------------------------------------------------------------- files
-
-    def save(self, path: Path | str) -> None:
-        """Write weights and arguments to one safetensors file."""
-        about = {"arguments": self.arguments, "inputs": asdict(self.inputs)}
-        state = {name: value.contiguous() for name, value in self.model.state_dict().items()}
-        save_file(state, path, metadata={"repose_network": json.dumps(about)})
-
-    @classmethod
-    def load(cls, path: Path | str) -> ReposeNetwork:
-        """The network in a file of `save`.
-
-        Raises:
-            ValueError: the file is of something else.
-        """
-        with safe_open(path, "pt") as file:
-            about = (file.metadata() or {}).get("repose_network")
-        if about is None:
-            raise ValueError(f"ReposeNetwork.load: {path} holds no network for poses")
-        arguments, inputs = (json.loads(about)[key] for key in ("arguments", "inputs"))
-        network = cls(arguments, Inputs(**inputs))
-        network.model.load_state_dict(load_file(path))
-        return network
-
-    @classmethod
-    def from_checkpoint(cls, path: Path | str) -> ReposeNetwork:
-        """The network in a checkpoint of `training.NJFTraining`, of kind "njf"."""
-        from njf_models.training import NJFTraining  # noqa: PLC0415  (seconds to import)
-
-        trained = NJFTraining.load_from_checkpoint(path, map_location="cpu")
-        network = cls(dict(trained.hparams["model"]), Inputs(**trained.hparams["inputs"]))
-        network.model.load_state_dict(trained.model.state_dict())
-        return network

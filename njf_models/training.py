@@ -24,15 +24,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from njf_models.baselines.cages import CageDeformation
-from njf_models.baselines.diffusion import DiffusionEncodedNJF, DiffusionMap
-from njf_models.baselines.displacement import DisplacementField
-from njf_models.baselines.global_mlp import GlobalMLP
 from njf_models.datasets.uv import UVPatch
 from njf_models.features import Motions, Shape, point_features
 from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss, sampled_loss
 from njf_models.metrics import count_flips
-from njf_models.njf import NeuralJacobianField, Prediction
+from njf_models.models import MODELS, Model
+from njf_models.njf import Prediction
 from njf_models.sampled import Cells
 
 
@@ -218,24 +215,6 @@ class _Stopwatch:
         self.earlier, self.started = self.seconds, None
 
 
-Model = (
-    NeuralJacobianField
-    | DisplacementField
-    | CageDeformation
-    | GlobalMLP
-    | DiffusionMap
-    | DiffusionEncodedNJF
-)
-MODELS: dict[str, type[Model]] = {
-    "njf": NeuralJacobianField,
-    "displacement": DisplacementField,
-    "cages": CageDeformation,
-    "global": GlobalMLP,
-    "diffusion": DiffusionMap,
-    "diffusion+njf": DiffusionEncodedNJF,
-}
-
-
 class NJFTraining(lightning.LightningModule):
     """Training with Adam, by the paper's schedule or by a cosine.
 
@@ -245,8 +224,8 @@ class NJFTraining(lightning.LightningModule):
         learning_rate: of Adam, at the start.
         patience: validations without improvement before the rate falls to a tenth (the paper).
         steps: let the rate fall to zero along a cosine over so many steps instead.
-        inputs: fields of `uv_network.Inputs`, what the network sees, for the record.
-        kind: one of `MODELS`: Neural Jacobian Fields, or a baseline.
+        inputs: fields of `trained.Inputs`, what the network sees, for the record.
+        kind: one of `models.MODELS`: Neural Jacobian Fields, or a baseline.
 
     Checkpoints record `training_seconds` and `cpu_seconds`, over all runs, validations included;
     None where an earlier run did not record its own.

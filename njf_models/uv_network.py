@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import diffpoisson as dp
 from diffpoisson.parameterization import require_disk
 from njf_models.datasets.patches import PatchRejectedError, align, has_pose
-from njf_models.features import Shape, point_features
-from njf_models.njf import NeuralJacobianField
+from njf_models.features import Shape
+from njf_models.trained import TrainedNetwork
 
 
 class PreparedDisk(NamedTuple):
@@ -38,33 +33,10 @@ class PreparedDisk(NamedTuple):
     scale: float
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """What a network sees of a shape.
+class UVNetwork(TrainedNetwork):
+    """A network for UV maps, of two output coordinates."""
 
-    Attributes:
-        n_points: number of surface points for the encoder.
-        n_energies: length of the wave-kernel signature, 0 for none.
-    """
-
-    n_points: int = 1024
-    n_energies: int = 0
-
-
-class UVNetwork:
-    """A network for UV maps, and how its inputs are made.
-
-    Args:
-        arguments: of the `NeuralJacobianField`, of two output coordinates.
-        inputs: what it sees.
-
-    Attributes:
-        model: the network.
-    """
-
-    def __init__(self, arguments: dict[str, Any], inputs: Inputs) -> None:
-        self.arguments, self.inputs = arguments, inputs
-        self.model = NeuralJacobianField(**arguments).eval()
+    holds: ClassVar[str] = "uv_network"
 
     def predict(self, mesh: dp.Mesh) -> Float[Tensor, "n 2"]:
         """The network's raw map of a disk, in the mesh's units: it may flip triangles.
@@ -96,15 +68,8 @@ class UVNetwork:
         """What depends on the mesh alone: pose, factor, features and points."""
         require_disk("UVNetwork", mesh, "njf_models.parameterize(mesh, cut=True) cuts it")
         scale = math.sqrt(float(mesh.areas.double().sum()))
-        aligned = _aligned(mesh)
-        solver = dp.PoissonSolver(aligned)
-        wks = None
-        if self.inputs.n_energies:
-            wks = dp.wave_kernel_signature(aligned, self.inputs.n_energies, solver=solver)
-        generator = torch.Generator().manual_seed(0)  # the same map at every call
-        samples = dp.sample_surface(aligned, self.inputs.n_points, generator=generator)
-        points = point_features(aligned, samples, wks).float()
-        return PreparedDisk(mesh, Shape.prepare(aligned, wks, solver=solver), points, scale)
+        shape, points = self.inputs.of(_aligned(mesh))
+        return PreparedDisk(mesh, shape, points, scale)
 
     @torch.no_grad()
     def predict_prepared(self, disks: Sequence[PreparedDisk]) -> list[Float[Tensor, "n 2"]]:
@@ -119,40 +84,6 @@ class UVNetwork:
             (disk.scale * uv.double()).to(disk.mesh.dtype)
             for disk, uv in zip(disks, maps, strict=True)
         ]
-
-    # ---------------------------------------------------------------- files
-
-    def save(self, path: Path | str) -> None:
-        """Write weights and arguments to one safetensors file."""
-        about = {"arguments": self.arguments, "inputs": asdict(self.inputs)}
-        state = {name: value.contiguous() for name, value in self.model.state_dict().items()}
-        save_file(state, path, metadata={"uv_network": json.dumps(about)})
-
-    @classmethod
-    def load(cls, path: Path | str) -> UVNetwork:
-        """The network in a file of `save`.
-
-        Raises:
-            ValueError: the file is of something else.
-        """
-        with safe_open(path, "pt") as file:
-            about = (file.metadata() or {}).get("uv_network")
-        if about is None:
-            raise ValueError(f"UVNetwork.load: {path} holds no UV network written by `save`")
-        arguments, inputs = (json.loads(about)[key] for key in ("arguments", "inputs"))
-        network = cls(arguments, Inputs(**inputs))
-        network.model.load_state_dict(load_file(path))
-        return network
-
-    @classmethod
-    def from_checkpoint(cls, path: Path | str) -> UVNetwork:
-        """The network in a checkpoint of `training.NJFTraining` that records its inputs."""
-        from njf_models.training import NJFTraining  # noqa: PLC0415  (seconds to import)
-
-        trained = NJFTraining.load_from_checkpoint(path, map_location="cpu")
-        network = cls(dict(trained.hparams["model"]), Inputs(**trained.hparams["inputs"]))
-        network.model.load_state_dict(trained.model.state_dict())
-        return network
 
 
 def _aligned(mesh: dp.Mesh) -> dp.Mesh:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,15 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     add("--batch-size", type=int, default=8, metavar="N", help="patches per step (8)")
     add("--rate", type=float, default=1e-3, help="learning rate at the start (1e-3)")
     add("--init", metavar="WEIGHTS", help="begin with these: a name (uv), .safetensors or .ckpt")
+    add(
+        "--encoder",
+        choices=("pointnet", "diffusion"),
+        default="pointnet",
+        help="how it learns of the whole: a code of its points, or features that diffuse on it",
+    )
+    add("--eigenpairs", type=int, default=64, metavar="N", help="to diffuse by (64)")
+    add("--net-width", type=int, default=64, metavar="N", help="channels of DiffusionNet (64)")
+    add("--net-blocks", type=int, default=2, metavar="N", help="its blocks (2)")
     add("--rounds", type=int, default=2, metavar="N", help="predictions and solves (2; paper 1)")
     add("--shared-rounds", action="store_true", help="one network for all corrections")
     add("--local-step", action="store_true", help="corrections start from closest rotations")
@@ -68,6 +78,7 @@ def run(options: argparse.Namespace) -> int:
     """Train until the steps or minutes are over."""
     import lightning  # noqa: PLC0415  (seconds to import)
 
+    from njf_models.trained import Inputs  # noqa: PLC0415
     from njf_models.training import (  # noqa: PLC0415
         NJFTraining,
         UVExamples,
@@ -81,9 +92,22 @@ def run(options: argparse.Namespace) -> int:
     parts = _split(options)
     train, validation = parts["train"], parts["validation"]
     print(f"{len(train)} training and {len(validation)} validation patches")
-    kind = {"n_points": options.points, "use_wks": options.wks}
+    n_energies = train[0].wks.shape[1] * options.wks
+    diffuses = options.encoder == "diffusion"
+    inputs = Inputs(
+        # The code of a network that diffuses is empty, whatever the points.
+        n_points=1 if diffuses else options.points,
+        n_energies=n_energies,
+        n_eigenpairs=options.eigenpairs if diffuses else 0,
+    )
+    seen = {
+        "n_points": inputs.n_points,
+        "use_wks": options.wks,
+        "n_eigenpairs": inputs.n_eigenpairs,
+    }
+    kind, model = _model(options, n_energies)
     module = NJFTraining(
-        _model(options, train[0].wks.shape[1]),
+        model,
         {
             "supervised": None if options.loss == "none" else options.loss,
             "distortion": options.distortion,
@@ -92,10 +116,11 @@ def run(options: argparse.Namespace) -> int:
         },
         learning_rate=options.rate,
         steps=options.steps,
-        inputs={"n_points": options.points, "n_energies": train[0].wks.shape[1] * options.wks},
+        inputs=asdict(inputs),
+        kind=kind,
     )
     if options.init is not None:
-        _begin_with(module.model, _model(options, train[0].wks.shape[1]), options.init)
+        _begin_with(module.model, model, options.init)
     trainer = make_trainer(
         options.out,
         minutes=options.minutes,
@@ -105,8 +130,8 @@ def run(options: argparse.Namespace) -> int:
     )
     trainer.fit(
         module,
-        loader(UVExamples(train, resample=True, **kind), options.batch_size, shuffle=True),
-        loader(UVExamples(validation, **kind), 16),
+        loader(UVExamples(train, resample=True, **seen), options.batch_size, shuffle=True),
+        loader(UVExamples(validation, **seen), 16),
         ckpt_path=last_checkpoint(options.out),
     )
     return 0
@@ -131,18 +156,21 @@ def _begin_with(model: nn.Module, arguments: dict[str, Any], weights: str) -> No
     model.load_state_dict(network.model.state_dict())
 
 
-def _model(options: argparse.Namespace, n_energies: int) -> dict[str, Any]:
-    n_features = 6 + n_energies * options.wks
-    return {
-        "face_features": n_features,
-        "point_features": n_features,
-        "code_size": options.code_size,
+def _model(options: argparse.Namespace, n_energies: int) -> tuple[str, dict[str, Any]]:
+    """The kind of the network, and its arguments."""
+    field = {
         "output_dim": 2,
         "rounds": options.rounds,
         "shared_rounds": options.shared_rounds,
         "width": options.width,
         "local_step": options.local_step,
     }
+    n_features = 6 + n_energies
+    if options.encoder == "diffusion":
+        net = {"net_width": options.net_width, "n_blocks": options.net_blocks}
+        return "diffusion+njf", {"features": n_features} | net | field
+    coded = {"face_features": n_features, "point_features": n_features}
+    return "njf", coded | {"code_size": options.code_size} | field
 
 
 def _split(options: argparse.Namespace) -> dict[str, UVStore]:

@@ -30,7 +30,7 @@ from njf_models.datasets.store import StoreError
 from njf_models.datasets.triangulation import Triangulation
 from njf_models.metrics import l2_vertices
 from njf_models.pretrained import load_pretrained
-from njf_models.uv_network import Inputs
+from njf_models.trained import Inputs
 
 pytestmark = pytest.mark.slow  # the body model takes a minute or more to build, the first time
 

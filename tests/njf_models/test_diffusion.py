@@ -11,10 +11,12 @@ from torch.testing import assert_close
 
 import diffpoisson as dp
 from njf_models import Shape
-from njf_models.baselines.diffusion import DiffusionEncodedNJF, DiffusionMap
+from njf_models.baselines.diffusion import DiffusionMap
 from njf_models.diffusion_net import DiffusionBlock, DiffusionNet
+from njf_models.diffusion_njf import DiffusionEncodedNJF
+from njf_models.models import MODELS
 from njf_models.spectrum import Spectrum
-from njf_models.training import MODELS, NJFTraining
+from njf_models.training import NJFTraining
 from tests import references
 from tests.njf_models.shapes import bumpy_disk, ellipsoid, randomised, with_frames_rotated
 

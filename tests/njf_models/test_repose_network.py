@@ -11,8 +11,9 @@ import njf_models
 from njf_models.body_maps import BodyMaps, evaluate_maps
 from njf_models.pretrained import card
 from njf_models.repose_network import ReposeNetwork
+from njf_models.trained import Inputs
 from njf_models.training import NJFTraining, make_trainer
-from njf_models.uv_network import Inputs, UVNetwork
+from njf_models.uv_network import UVNetwork
 from tests.njf_models.shapes import bumpy_disk, randomised
 from tests.njf_models.test_body_maps import MODEL, twisted
 
@@ -59,9 +60,9 @@ def test_files_keep_all_that_the_maps_depend_on(tmp_path):
 
     uv = UVNetwork({"face_features": 6, "point_features": 6, "output_dim": 2}, Inputs())
     uv.save(tmp_path / "uv.safetensors")
-    with pytest.raises(ValueError, match="no network for poses"):
+    with pytest.raises(ValueError, match="holds no ReposeNetwork"):
         ReposeNetwork.load(tmp_path / "uv.safetensors")
-    with pytest.raises(ValueError, match="no UV network"):
+    with pytest.raises(ValueError, match="holds no UVNetwork"):
         UVNetwork.load(tmp_path / "repose.safetensors")
 
 

@@ -20,9 +20,9 @@ from njf_models.body_maps import (
     summarise,
 )
 from njf_models.losses import paper_loss, sampled_loss
+from njf_models.models import MODELS
 from njf_models.sampled import Cells
 from njf_models.training import (
-    MODELS,
     NJFTraining,
     Phase,
     fit_phases,

@@ -17,6 +17,13 @@ from tests import meshes
 from tests.njf_models.shapes import bumpy_disk
 
 
+def moves(network: UVNetwork) -> bool:
+    """Whether it maps otherwise than before its training, and finitely."""
+    mesh = bumpy_disk(0)
+    untrained = UVNetwork(network.arguments, network.inputs, network.kind).predict(mesh)
+    return bool(0 < float((network.predict(mesh) - untrained).abs().max()) < np.inf)
+
+
 def test_data_and_training_by_their_commands(tmp_path, capsys):
     store, out = tmp_path / "store", tmp_path / "run"
     data = [
@@ -51,10 +58,14 @@ def test_data_and_training_by_their_commands(tmp_path, capsys):
     assert torch.load(checkpoint, weights_only=False)["global_step"] == 4  # its very end
     network = UVNetwork.from_checkpoint(checkpoint)
     assert (network.model.rounds, network.inputs.n_points, network.inputs.n_energies) == (2, 32, 0)
-    mesh = bumpy_disk(0)
-    untrained = UVNetwork(network.arguments, network.inputs).predict(mesh)
-    moved = (network.predict(mesh) - untrained).abs().max()
-    assert 0 < float(moved) < np.inf
+    assert moves(network)
+
+    train[2] = str(tmp_path / "diffusing")
+    net = ["--encoder", "diffusion", "--eigenpairs", "12", "--net-width", "8", "--net-blocks", "1"]
+    assert main([*train, *net, "--rounds", "2", "--steps", "3"]) == 0
+    network = UVNetwork.from_checkpoint(last_checkpoint(tmp_path / "diffusing"))
+    assert (network.kind, network.inputs.n_eigenpairs) == ("diffusion+njf", 12)
+    assert moves(network)
 
 
 def test_data_from_a_cluster_by_its_address(tmp_path, capsys):

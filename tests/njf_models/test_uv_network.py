@@ -12,7 +12,8 @@ from torch.testing import assert_close
 import diffpoisson as dp
 from njf_models import parameterize
 from njf_models.pretrained import load_pretrained
-from njf_models.uv_network import Inputs, UVNetwork
+from njf_models.trained import Inputs
+from njf_models.uv_network import UVNetwork
 from tests import meshes
 from tests.njf_models.shapes import bumpy_disk
 
@@ -24,12 +25,24 @@ ARGUMENTS = {
     "rounds": 2,
     "width": 16,
 }
+DIFFUSING = {
+    "features": 6, "encoded": 4, "net_width": 8, "n_blocks": 1,
+    "output_dim": 2, "rounds": 2, "width": 16,
+}  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def network() -> UVNetwork:
+NETWORKS = {
+    "njf": lambda: UVNetwork(ARGUMENTS, Inputs(n_points=64)),
+    "diffusion+njf": lambda: UVNetwork(
+        DIFFUSING, Inputs(n_points=1, n_eigenpairs=10), "diffusion+njf"
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=NETWORKS)
+def network(request) -> UVNetwork:
     """Random weights, small enough that the map is not all flips."""
-    network = UVNetwork(ARGUMENTS, Inputs(n_points=64))
+    network = NETWORKS[request.param]()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in network.model.parameters():
@@ -68,6 +81,15 @@ def test_wave_kernel_signature_is_made_on_demand():
     assert network.predict(disk.mesh).isfinite().all()
 
 
+def test_a_mesh_of_fewer_vertices_than_eigenpairs_has_all_of_its_own():
+    network = UVNetwork(DIFFUSING, Inputs(n_points=1, n_eigenpairs=10), "diffusion+njf")
+    triangle = dp.Mesh(torch.eye(3, dtype=torch.float64), torch.tensor([[0, 1, 2]]))
+    (spectrum,) = network.prepare(triangle).shape.spectra
+    assert len(spectrum.values) == 3
+    # One triangle is mapped without error: its Jacobian is the prediction's.
+    assert network.predict(triangle).isfinite().all()
+
+
 @pytest.mark.parametrize("make", [meshes.sphere, meshes.annulus, meshes.parts])
 def test_other_surfaces_raise_and_name_the_remedy(network, make):
     with pytest.raises(dp.MeshError, match=r"topological disk.*cut=True"):
@@ -85,13 +107,14 @@ def test_saved_and_loaded(network, tmp_path):
     loaded = UVNetwork.load(tmp_path / "uv.safetensors")
     mesh = bumpy_disk(0)
     assert torch.equal(loaded.predict(mesh), network.predict(mesh))
-    assert (loaded.arguments, loaded.inputs) == (network.arguments, network.inputs)
+    for name in ("arguments", "inputs", "kind"):
+        assert getattr(loaded, name) == getattr(network, name)
     assert not loaded.model.training
 
 
 def test_files_of_other_things_raise(tmp_path):
     save_file({"weight": torch.zeros(3)}, tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match="no UV network"):
+    with pytest.raises(ValueError, match="holds no UVNetwork"):
         UVNetwork.load(tmp_path / "other.safetensors")
 
 

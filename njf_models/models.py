@@ -1,0 +1,27 @@
+"""The networks that `training` trains and `trained` keeps, by the names of their kinds."""
+
+from __future__ import annotations
+
+from njf_models.baselines.cages import CageDeformation
+from njf_models.baselines.diffusion import DiffusionMap
+from njf_models.baselines.displacement import DisplacementField
+from njf_models.baselines.global_mlp import GlobalMLP
+from njf_models.diffusion_njf import DiffusionEncodedNJF
+from njf_models.njf import NeuralJacobianField
+
+Model = (
+    NeuralJacobianField
+    | DisplacementField
+    | CageDeformation
+    | GlobalMLP
+    | DiffusionMap
+    | DiffusionEncodedNJF
+)
+MODELS: dict[str, type[Model]] = {
+    "njf": NeuralJacobianField,
+    "displacement": DisplacementField,
+    "cages": CageDeformation,
+    "global": GlobalMLP,
+    "diffusion": DiffusionMap,
+    "diffusion+njf": DiffusionEncodedNJF,
+}

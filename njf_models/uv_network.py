@@ -38,6 +38,25 @@ class UVNetwork(TrainedNetwork):
 
     holds: ClassVar[str] = "uv_network"
 
+    def with_rounds(self, rounds: int) -> UVNetwork:
+        """The same network, stopped after so many of its rounds: faster, and less exact.
+
+        In training the map of each round is compared with the target, so that each may be the last.
+
+        Raises:
+            ValueError: the network has fewer rounds, or shares the weights of its corrections.
+        """
+        trained = self.arguments.get("rounds", 1)
+        if not 1 <= rounds <= trained or self.arguments.get("shared_rounds"):
+            raise ValueError(
+                f"UVNetwork.with_rounds: expected 1 to {trained} rounds of separate weights, "
+                f"got {rounds}"
+            )
+        shorter = UVNetwork(self.arguments | {"rounds": rounds}, self.inputs, self.kind)
+        weights = self.model.state_dict()
+        shorter.model.load_state_dict({name: weights[name] for name in shorter.model.state_dict()})
+        return shorter
+
     def predict(self, mesh: dp.Mesh) -> Float[Tensor, "n 2"]:
         """The network's raw map of a disk, in the mesh's units: it may flip triangles.
 

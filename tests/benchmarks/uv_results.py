@@ -40,12 +40,25 @@ def test_patches(store: Path, split: Path) -> UVStore:
 
 
 def raw_summaries(network: UVNetwork, patches: UVStore) -> dict[str, Any]:
-    """The paper's figures, of all and of filtered patches."""
+    """The paper's figures, of all and of filtered patches, and of fewer rounds."""
     inputs = network.inputs
-    examples = UVExamples(patches, n_points=inputs.n_points, use_wks=inputs.n_energies > 0)
-    records, _ = evaluate_uv(network.model, examples)
-    kept = [r for r in records if r.flatness >= FILTERED and r.slim_energy <= MILD]
-    return {"all": summarise(records), "filtered": summarise(kept)}
+    examples = UVExamples(
+        patches,
+        n_points=inputs.n_points,
+        use_wks=inputs.n_energies > 0,
+        n_eigenpairs=inputs.n_eigenpairs,
+    )
+    summaries = {}
+    for rounds, stopped in by_rounds(network).items():
+        records, _ = evaluate_uv(stopped.model, examples)
+        kept = [r for r in records if r.flatness >= FILTERED and r.slim_energy <= MILD]
+        summaries[rounds] = {"all": summarise(records), "filtered": summarise(kept)}
+    return summaries[network.arguments["rounds"]] | {"rounds": summaries}
+
+
+def by_rounds(network: UVNetwork) -> dict[int, UVNetwork]:
+    """The network, stopped after each of its rounds."""
+    return {k: network.with_rounds(k) for k in range(1, network.arguments["rounds"] + 1)}
 
 
 def mapped(network: UVNetwork, mesh: dp.Mesh) -> dict[str, Any]:
@@ -96,6 +109,13 @@ def quartile_of_iterations(records: list[dict[str, Any]]) -> dict[str, float]:
     return {"from Tutte": float(np.median(hardest[:, 0])), "ours": float(np.median(hardest[:, 1]))}
 
 
+Contestant = tuple[str, Callable[[], None]]
+
+
+def raw_name(rounds: int) -> str:
+    return f"raw, prepared, {rounds} rounds"
+
+
 def rates(network: UVNetwork, meshes: list[dp.Mesh], batch: int, rounds: int) -> dict[str, Any]:
     """Patches per second, raw from prepared and from plain meshes, and of 20 SLIM iterations."""
     prepared = [network.prepare(mesh) for mesh in meshes]
@@ -118,27 +138,35 @@ def rates(network: UVNetwork, meshes: list[dp.Mesh], batch: int, rounds: int) ->
             mesh = dp.Mesh(*arrays)
             dp.slim(mesh, dp.tutte(mesh), tolerance=0, max_iterations=20)
 
-    contestants: dict[str, Callable[[], None]] = {
-        "raw, prepared": lambda: in_batches(network.predict_prepared, prepared),
-        "20 SLIM iterations": lambda: slim_from(list(zip(meshes, starts, strict=True))),
-        "raw, from (V, F)": lambda: in_batches(from_arrays, plain),
-        "Tutte and 20 SLIM iterations, from (V, F)": lambda: tutte_and_slim(plain),
-    }
-    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    def raw(rounds: int, stopped: UVNetwork) -> Contestant:
+        return raw_name(rounds), lambda: in_batches(stopped.predict_prepared, prepared)
+
+    contestants = [
+        *(raw(rounds, stopped) for rounds, stopped in by_rounds(network).items()),
+        ("20 SLIM iterations", lambda: slim_from(list(zip(meshes, starts, strict=True)))),
+        ("raw, from (V, F)", lambda: in_batches(from_arrays, plain)),
+        ("Tutte and 20 SLIM iterations, from (V, F)", lambda: tutte_and_slim(plain)),
+    ]
+    seconds: dict[str, list[float]] = {name: [] for name, _ in contestants}
     for _ in range(rounds):
-        for name, work in contestants.items():
+        for name, work in contestants:
             start = time.perf_counter()
             work()
             seconds[name].append(time.perf_counter() - start)
     rate = {n: sorted(len(meshes) / s for s in times[1:]) for n, times in seconds.items()}
 
-    def ratio(ours: str, theirs: str) -> list[float]:
-        return [b / a for a, b in zip(seconds[ours][1:], seconds[theirs][1:], strict=True)]
+    def ratio(ours: str, theirs: str) -> float:
+        pairs = zip(seconds[ours][1:], seconds[theirs][1:], strict=True)
+        return float(np.median([b / a for a, b in pairs]))
 
     return {
         "patches per second": {n: [r[0], float(np.median(r)), r[-1]] for n, r in rate.items()},
-        "prepared over SLIM": float(np.median(ratio(*list(contestants)[:2]))),
-        "from (V, F) over Tutte and SLIM": float(np.median(ratio(*list(contestants)[2:]))),
+        "prepared over SLIM": {
+            k: ratio(raw_name(k), "20 SLIM iterations") for k in by_rounds(network)
+        },
+        "from (V, F) over Tutte and SLIM": ratio(
+            "raw, from (V, F)", "Tutte and 20 SLIM iterations, from (V, F)"
+        ),
         "faces per patch": float(np.mean([mesh.n_faces for mesh in meshes])),
         "batch": batch,
         "rounds": rounds - 1,

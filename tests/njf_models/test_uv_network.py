@@ -102,6 +102,21 @@ def test_planar_meshes_and_tetrahedra_raise(network):
             network.predict(dp.Mesh(*make(0)))
 
 
+def test_stopped_after_fewer_rounds(network):
+    """The map of the first round, and the whole network where nothing is left out."""
+    mesh = bumpy_disk(2)
+    disk = network.prepare(mesh)
+    code = network.model.encode(disk.points[None])
+    first, last = network.model.iterates(disk.shape, code)
+    for rounds, iterate in ((1, first), (2, last)):
+        uv = network.with_rounds(rounds).predict(mesh)
+        assert_close(uv, disk.scale * iterate.vertices[0].detach().double())
+    assert not torch.allclose(first.vertices, last.vertices, rtol=1e-2)
+    for rounds in (0, 3):
+        with pytest.raises(ValueError, match=f"1 to 2 rounds of separate weights, got {rounds}"):
+            network.with_rounds(rounds)
+
+
 def test_saved_and_loaded(network, tmp_path):
     network.save(tmp_path / "uv.safetensors")
     loaded = UVNetwork.load(tmp_path / "uv.safetensors")

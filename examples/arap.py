@@ -20,10 +20,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import platform
 import time
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +49,7 @@ from njf_models.elastic_maps import (
     summarise,
 )
 from njf_models.evaluation import format_table
+from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.features import Shape
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 
@@ -63,8 +61,7 @@ N_VALIDATIONS = 10
 def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     options = parse(argv)
     options.out.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
-    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+    quiet()
 
     solid = make_solid(options)
     maps = make_maps(solid, options)
@@ -74,7 +71,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
         title = KINDS[kind]
         steps = plan(kind, maps["train"], shape, options)
         checkpoint = fit(kind, steps, maps, shape, options)
-        costs[title] = {"steps": steps, **cost(checkpoint)}
+        costs[title] = {"steps": steps, **training_cost(checkpoint)}
         model = load_checkpoint(checkpoint)
         for pinned in (False, True):
             of_model = evaluate_elastic(model, maps["test"], shape, pinned=pinned)
@@ -87,11 +84,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     print("\nUnseen positions of the handles:\n" + format_table(table))
     print("\nThe solver:\n" + "\n".join(f"{name}: {value:.4g}" for name, value in solver.items()))
     results = {
-        "options": {
-            name: value for name, value in vars(options).items() if not isinstance(value, Path)
-        },
-        "torch": torch.__version__,
-        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        **circumstances(options),
         "training": costs,
         "solver": solver,
         "summary": table,
@@ -191,12 +184,6 @@ def fit(
         ckpt_path=last_checkpoint(folder),
     )
     return folder / "checkpoints" / "best.ckpt"
-
-
-def cost(checkpoint: Path) -> dict[str, float | None]:
-    """What the training until the last step took."""
-    last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
-    return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
 
 
 def unmoved(test: ArapMaps, shape: Shape, options: argparse.Namespace) -> list[ElasticRecord]:

@@ -17,9 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import platform
-import warnings
 from pathlib import Path
 
 import lightning
@@ -36,6 +33,7 @@ from njf_models.contact_maps import ContactRecord, block_shape, evaluate_contact
 from njf_models.datasets.contact import ContactMaps, ContactSettings, build_contact
 from njf_models.elastic_maps import ElasticBatches, elastic_loader
 from njf_models.evaluation import format_table
+from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.features import Shape
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 
@@ -48,8 +46,7 @@ ERROR_LIMIT = 0.1  # where the colours of the error end; the block is 1 high
 def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     options = parse(argv)
     options.out.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
-    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+    quiet()
 
     maps = make_maps(options)
     shape = block_shape(maps["test"].scene)
@@ -58,8 +55,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     for kind, title in KINDS.items():
         steps = plan(kind, maps["train"], shape, options)
         checkpoint = fit(kind, steps, maps, shape, options)
-        last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
-        costs[title] = {"steps": steps, "cpu seconds": last["cpu_seconds"]}
+        costs[title] = {"steps": steps, **training_cost(checkpoint)}
         records[title], before, after = evaluate_contact(
             load_checkpoint(checkpoint), maps["test"], shape
         )
@@ -70,11 +66,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     table |= {title: summarise(of_model) for title, of_model in records.items()}
     print("\nUnseen trajectories:\n" + format_table(table))
     results = {
-        "options": {
-            name: value for name, value in vars(options).items() if not isinstance(value, Path)
-        },
-        "torch": torch.__version__,
-        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        **circumstances(options),
         "training": costs,
         "Newton steps of a state, mean": float(maps["test"].iterations.float().mean()),
         "summary": table,

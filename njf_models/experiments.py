@@ -1,0 +1,35 @@
+"""What the scripts of `examples/` say of an experiment: where it ran, and what training took."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import platform
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+
+def quiet() -> None:
+    """No advertisements and no warnings of Lightning's own doing."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+
+
+def circumstances(options: argparse.Namespace) -> dict[str, Any]:
+    """Options but for paths, torch and the machine, for a record in JSON."""
+    return {
+        "options": {
+            name: value for name, value in vars(options).items() if not isinstance(value, Path)
+        },
+        "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+    }
+
+
+def training_cost(checkpoint: Path) -> dict[str, float | None]:
+    """Seconds of the training whose last checkpoint lies beside this one, until its last step."""
+    last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
+    return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}

@@ -23,24 +23,30 @@ RESULTS = DOCS / "results"
 
 
 def uv_train() -> str:
-    """The example's test split, beside the paper's figures on other data."""
-    results = json.loads((RESULTS / "uv_train.json").read_text())
-    before, after = results["summary"]["untrained"], results["summary"]["trained"]
+    """The example's test split, beside the paper's network and its figures on other data."""
+    ours, theirs = (
+        json.loads((RESULTS / f"{name}.json").read_text())
+        for name in ("uv_train", "uv_train_paper")
+    )
+    assert ours["splits"] == theirs["splits"]
+    before, after = ours["summary"]["untrained"], ours["summary"]["trained"]
+    papers = theirs["summary"]["trained"]
     paper = {  # Table 1 of the paper: Thingi10K patches / other meshes
         "patches with a flip, raw, %": "19 / 10",
         "flips per patch, raw": "3.44 / 0.77",
         "D>10 per patch, raw": "5.67 / 1.99",
     }
     rows = [
-        f"| {name} | {number(before[name])} | {number(after[name])} | {paper.get(name, '–')} |"
+        f"| {name} | {number(before[name])} | {number(papers[name])} | {number(after[name])} "
+        f"| {paper.get(name, '–')} |"
         for name in after
         if name not in ("patches", "milliseconds per patch, median")  # times depend on the load
     ]
     return "\n".join(
         [
-            f"| {after['patches']:.0f} patches of unseen meshes | untrained: projection | trained "
-            "| paper, other data |",
-            "|---|---|---|---|",
+            f"| {after['patches']:.0f} patches of unseen meshes | untrained: projection "
+            "| the paper's network | ours | paper, other data |",
+            "|---|---|---|---|---|",
             *rows,
         ]
     )
@@ -246,6 +252,35 @@ def uv_rounds() -> str:
     return "\n".join(lines)
 
 
+def uv_weights() -> str:
+    """Both weights for UV maps, on the same patches and machine."""
+    results = {
+        "`uv`: DiffusionNet, 32 eigenpairs": "uv",
+        "`uv-pointnet`: PointNet, no eigenpairs": "uv_pointnet",
+    }
+    lines = [
+        "| filtered patches | patches with a flip, raw, % | patches with a flip, % | symmetric "
+        "Dirichlet, median | SLIM iterations to 1%, hardest quarter | over 20 SLIM iterations: prepared | "
+        "from (V, F) | bytes |",
+        "|---" * 8 + "|",
+    ]
+    for title, name in results.items():
+        result = json.loads((RESULTS / f"{name}.json").read_text())
+        raw, rates = result["raw"]["filtered"], result["rates"]
+        weights = DOCS.parent / "njf_models" / "weights" / f"{name.replace('_', '-')}.safetensors"
+        cells = [
+            number(raw["patches with a flip, raw, %"]),
+            number(raw["patches with a flip, %"]),
+            number(raw["symmetric Dirichlet, median"]),
+            number(result["iterations to 1%, hardest quarter"]["ours"]),
+            number(list(rates["prepared over SLIM"].values())[-1]),
+            number(rates["from (V, F) over Tutte and SLIM"]),
+            f"{weights.stat().st_size:,}",
+        ]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def uv_ablation() -> str:
     """Variants of the UV network, from `tests/benchmarks/uv_ablation.py`."""
     result = json.loads((RESULTS / "uv_ablation.json").read_text())
@@ -273,6 +308,7 @@ def uv_diffusion() -> str:
         "D>10 per patch": "D>10 per patch",
         "flips per patch, raw": "flips per patch, raw",
         "patches with a flip, %": "patches with a flip, %",
+        "energy over SLIM's, median": "energy over SLIM's, median",
         "L2-J, median": "L2-J, median",
     }
     lines = [f"| | {' | '.join(columns)} | steps |", "|---" * (2 + len(columns)) + "|"]
@@ -695,6 +731,7 @@ TABLES = {
     "data_cost": data_cost,
     "uv": uv,
     "uv_rounds": uv_rounds,
+    "uv_weights": uv_weights,
     "uv_ablation": uv_ablation,
     "uv_certified": uv_certified,
     "uv_diffusion": uv_diffusion,

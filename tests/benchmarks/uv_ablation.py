@@ -43,7 +43,7 @@ class Variant:
 
 
 VARIANTS = {
-    "as shipped: 4 rounds": Variant(),
+    "4 rounds": Variant(),
     "1 round": Variant({"rounds": 1, "local_step": False}),
     "1 round, 128 wide, the paper's loss, WKS": Variant(
         {"rounds": 1, "local_step": False, "width": 128},

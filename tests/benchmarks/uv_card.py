@@ -18,17 +18,20 @@ import torch
 from njf_models.datasets.store import PatchFilter, UVStore
 from njf_models.uv_network import UVNetwork
 
+KINDS = {
+    "njf": "Neural Jacobian Field",
+    "diffusion+njf": "Neural Jacobian Field with DiffusionNet as encoder",
+}
 WEIGHTS = Path(__file__).parents[2] / "njf_models" / "weights"
 
 
-def minutes_of_training(checkpoint: dict[str, Any], told: float | None) -> float:
-    """As the checkpoint records them, else as told."""
-    seconds = checkpoint.get("training_seconds")
-    if seconds is not None:
-        return round(seconds / 60, 1)
-    if told is None:
-        raise SystemExit("the checkpoint does not record how long training took: pass --minutes")
-    return told
+def steps(checkpoint: dict[str, Any] | None) -> int:
+    return 0 if checkpoint is None else int(checkpoint["global_step"])
+
+
+def seconds(checkpoint: dict[str, Any] | None) -> float:
+    """Of processor time."""
+    return 0.0 if checkpoint is None else float(checkpoint["cpu_seconds"])
 
 
 def main() -> None:
@@ -36,15 +39,13 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("commands", nargs="+")
-    parser.add_argument(
-        "--minutes", type=float, help="of training, if the checkpoint has no record"
-    )
+    parser.add_argument("--begun-with", type=Path, help="checkpoint that training began with")
     parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--max-energy", type=float, default=8.0, help="as training had it")
     options = parser.parse_args()
     checkpoint = options.out / "checkpoints" / "best.ckpt"
     record = torch.load(checkpoint, map_location="cpu", weights_only=False)
-    minutes = minutes_of_training(record, options.minutes)
+    before = options.begun_with and torch.load(options.begun_with, weights_only=False)
     WEIGHTS.mkdir(exist_ok=True)
     network = UVNetwork.from_checkpoint(checkpoint)
     network.save(WEIGHTS / "uv.safetensors")
@@ -54,7 +55,7 @@ def main() -> None:
     counts = {n: sum(f in set(names) for f in store.family) for n, names in split.items()}
     licences = Counter(source["licence"] for source in store.sources)
     card = {
-        "what": "UV maps of disk patches: Neural Jacobian Field, "
+        "what": f"UV maps of disk patches: {KINDS[network.kind]}, "
         f"{network.arguments['rounds']} rounds, {network.arguments['width']} wide",
         "parameters": sum(p.numel() for p in network.model.parameters()),
         "bytes": (WEIGHTS / "uv.safetensors").stat().st_size,
@@ -64,8 +65,8 @@ def main() -> None:
         "licences of the meshes": ", ".join(f"{n} {name}" for name, n in licences.most_common()),
         "split by mesh family": ", ".join(f"{n} {name}" for name, n in counts.items()),
         "chosen by": "loss on the validation split",
-        "optimiser steps": int(record["global_step"]),
-        "minutes of training": minutes,
+        "optimiser steps": steps(record) + steps(before),
+        "minutes of processor time": round((seconds(record) + seconds(before)) / 60, 1),
         "machine": options.machine,
         "commands": " ; ".join(options.commands),
         "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open have no "

@@ -24,7 +24,6 @@ from tests.benchmarks.uv_ablation import OBJECTIVE, SHIPPED, TimedTraining, figu
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "uv_diffusion.json"
 PAPER = {"supervised": "paper", "augment": True}
-EIGENPAIRS = 64
 
 
 class Contestant(NamedTuple):
@@ -34,20 +33,30 @@ class Contestant(NamedTuple):
     model: dict[str, Any]
     objective: dict[str, Any]
     wks: bool = False
+    eigenpairs: int = 64
 
 
 CODED = {"face_features": 6, "point_features": 6, "code_size": 256}
 SIGNED = {"face_features": 56, "point_features": 56, "code_size": 256}
+
+
+def diffusing(channels: int, width: int, **options: int) -> Contestant:
+    """Four rounds with DiffusionNet as their encoder."""
+    model = {"features": 6, "net_width": channels} | SHIPPED | {"width": width}
+    return Contestant("diffusion+njf", model, OBJECTIVE, **options)
+
+
 CONTESTANTS = {
     "NJF of the paper: PointNet and WKS, 1 round": Contestant("njf", SIGNED, PAPER, wks=True),
     "DiffusionNet predicts UVs": Contestant("diffusion", {"features": 6}, PAPER),
-    "NJF with DiffusionNet as encoder, 1 round": Contestant(
+    "the paper's NJF with DiffusionNet as encoder": Contestant(
         "diffusion+njf", {"features": 6}, PAPER
     ),
-    "NJF as shipped: PointNet, 4 rounds": Contestant("njf", CODED | SHIPPED, OBJECTIVE),
-    "the same with DiffusionNet as encoder": Contestant(
-        "diffusion+njf", {"features": 6} | SHIPPED, OBJECTIVE
-    ),
+    "4 rounds, 64 wide, PointNet": Contestant("njf", CODED | SHIPPED, OBJECTIVE),
+    "4 rounds, 64 wide, DiffusionNet of 64 channels": diffusing(64, 64),
+    "4 rounds, 32 wide, DiffusionNet of 64 channels": diffusing(64, 32),
+    "4 rounds, 32 wide, DiffusionNet of 32 channels": diffusing(32, 32),
+    "the same with 32 eigenpairs instead of 64": diffusing(32, 32, eigenpairs=32),
 }
 
 
@@ -83,7 +92,9 @@ def main() -> None:
                 n_points=256,
                 resample=part == "train",
                 use_wks=contestant.wks,
-                n_eigenpairs=EIGENPAIRS if contestant.kind.startswith("diffusion") else 0,
+                n_eigenpairs=contestant.eigenpairs
+                if contestant.kind.startswith("diffusion")
+                else 0,
             )
             for part in ("train", "validation")
         )

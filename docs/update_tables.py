@@ -260,8 +260,8 @@ def uv_weights() -> str:
     }
     lines = [
         "| filtered patches | patches with a flip, raw, % | patches with a flip, % | symmetric "
-        "Dirichlet, median | SLIM iterations to 1%, hardest quarter | over 20 SLIM iterations: prepared | "
-        "from (V, F) | bytes |",
+        "Dirichlet, median | SLIM iterations to 1%, hardest quarter | over 20 SLIM iterations: "
+        "prepared | from (V, F) | bytes |",
         "|---" * 8 + "|",
     ]
     for title, name in results.items():

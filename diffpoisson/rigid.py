@@ -166,9 +166,9 @@ def _energy(
 ) -> Float[Tensor, "*batch"]:
     """That of a map with its own closest rotations."""
     mesh, constraints = solver.mesh, solver.constraints
-    weights = constraints.face_weights.to(phi) * mesh.measures.to(phi)
+    weights = constraints.face_weights * mesh._double_measures
     energy = (weights * arap(jacobians(mesh, phi))).sum(-1)
     if handles is None:
         return energy
     missed = (phi[..., constraints.handles, :] - handles).square().sum(-1)
-    return energy + (constraints.handle_weights.to(phi) * missed).sum(-1)
+    return energy + (constraints.handle_weights * missed).sum(-1)

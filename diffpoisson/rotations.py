@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.transforms import without_autocast
+
 _STEPS = 2  # k of them give derivatives up to order 2ᵏ - 1
 
 Matrices = Float[Tensor, "*batch 3 3"]
@@ -30,7 +32,7 @@ def nearest_rotation(J: Matrices) -> Matrices:
     """
     size = J.detach().abs().amax((-2, -1), keepdim=True)  # NaN or infinite if any entry is
     J = J / torch.where(size > 0, size, 1)
-    with torch.autocast(J.device.type, enabled=False):  # it would round to half precision
+    with without_autocast(J.device):
         # LAPACK refuses the whole batch for one NaN.
         Q = _by_singular_vectors(J.detach().nan_to_num())
         Q = torch.where(size.isfinite(), Q, torch.nan)

@@ -226,9 +226,34 @@ def test_closest_rotation_is_the_polar_factor():
     U[..., 1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     Q = dp.closest_rotation(J)
     assert_near(Q, U @ Vt, 1e-13)
-    assert_near(dp.closest_rotation(1e-150 * J), Q, 1e-13)
-    assert_near(dp.closest_rotation(1e150 * J), Q, 1e-13)
-    assert torch.autograd.gradcheck(dp.closest_rotation, J[0].requires_grad_())
+    leaf = J[0].clone().requires_grad_()
+    assert gradcheck(dp.closest_rotation, leaf)
+    assert gradgradcheck(dp.closest_rotation, leaf)
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1e-158, 1e-3, 1e3, 1e158, 1e290])
+def test_scale_does_not_turn_the_closest_rotation(scale):
+    """Where squares leave the range, too; the derivative is that for the scaled direction."""
+    J, v = random_jacobians(2), random_jacobians(2, seed=1)
+    expected = torch.func.jvp(dp.closest_rotation, (J,), (v,))
+    found = torch.func.jvp(dp.closest_rotation, (scale * J,), (scale * v,))
+    for a, b in zip(found, expected, strict=True):
+        assert_near(a, b, 1e-13)
+    gradients = []
+    for size in (1.0, scale):
+        leaf = (size * J).requires_grad_()
+        gradients.append(size * torch.autograd.grad(dp.closest_rotation(leaf), leaf, v)[0])
+    assert_near(gradients[1], gradients[0], 1e-13)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_what_is_not_finite_has_no_closest_rotation(value):
+    J = random_jacobians(2, 3)
+    expected = dp.closest_rotation(J)[::2]
+    J[1, 0, 1] = value
+    Q = dp.closest_rotation(J)
+    assert Q[1].isnan().all()
+    assert torch.equal(Q[::2], expected)
 
 
 @given(jacobians(), angles)

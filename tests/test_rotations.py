@@ -162,6 +162,12 @@ def test_just_above_the_bound_of_rounding_there_is_a_derivative(dtype, flat):
         assert_near(found, expected, 0.3)
 
 
+@pytest.mark.parametrize("shape", [(4, 2, 2), (4, 3, 2), (4, 3, 3)])
+def test_without_values_there_is_a_shape(shape):
+    """On the meta device, which has no autocast."""
+    assert dp.closest_rotation(torch.zeros(shape, device="meta")).shape == shape
+
+
 def test_shapes_and_dtypes_it_refuses(unchecked):
     with pytest.raises(ValueError, match=r"expected J of shape"):
         dp.closest_rotation(torch.zeros(5, 2, 3))

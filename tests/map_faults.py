@@ -5,6 +5,7 @@ Like `faults.py`, for the checks of `map_checks.py`.
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import torch
@@ -132,11 +133,10 @@ def energy_without_handles(patch):
 
 
 def with_constraints(solver, **fields):
-    """What `_energy` reads of a solver, with other weights."""
-    constraints = solver.constraints
-    names = ("face_weights", "handle_weights", "handles")
-    own = {name: getattr(constraints, name) for name in names}
-    return SimpleNamespace(mesh=solver.mesh, constraints=SimpleNamespace(**own | fields))
+    """A solver with other weights, for what reads these alone."""
+    other = object.__new__(type(solver))
+    other.mesh, other.constraints = solver.mesh, dataclasses.replace(solver.constraints, **fields)
+    return other
 
 
 @fault("energies_of_rigid_maps")
@@ -173,7 +173,7 @@ def moves_by_the_farthest_vertex(patch):
 
 
 @fault("moves_of_rigid_maps")
-def moves_in_the_meshs_unit(patch):
+def moves_in_units_of_the_mesh(patch):
     """The stop rule does not compare with a size at all."""
     wrap(patch, rigid, "_diagonal", lambda f, mesh: torch.ones_like(f(mesh)))
 

@@ -111,8 +111,7 @@ def as_rigid_as_possible(
         previous, phi = phi, solver(rotations, pins=pins, handles=handles)
         energies.append(_energy(solver, phi, handles))
         if step > 0:  # the start need not meet the pins
-            move = torch.linalg.vector_norm((phi - previous).detach(), dim=-1)
-            moves.append(move.amax() / size)
+            moves.append(_largest_move(previous, phi) / size)
         if tolerance is not None and moves and bool(moves[-1] <= tolerance):
             break
     else:
@@ -146,6 +145,14 @@ def _start(mesh: Mesh, given: list[Tensor], start: Tensor | None) -> Float[Tenso
             "that its positions can't be the start; give one, such as tutte(mesh)"
         )
     return mesh.vertices.double()
+
+
+def _largest_move(
+    before: Float[Tensor, "*batch n c"], after: Float[Tensor, "*#batch n c"]
+) -> Float[Tensor, ""]:
+    """Of any vertex of any map, without a gradient; zero if there are no maps."""
+    moves = torch.linalg.vector_norm((after - before).detach(), dim=-1)
+    return moves.amax() if moves.numel() else moves.new_zeros(())
 
 
 def _diagonal(mesh: Mesh) -> Float[Tensor, ""]:

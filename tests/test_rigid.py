@@ -303,6 +303,16 @@ def test_batches_of_starts_meet_batches_of_pins():
         assert_near(found.energies[i, j], alone.energies, 1e-12)
 
 
+def test_of_no_maps_there_are_none():
+    mesh = KINDS["tetrahedra"]()
+    pins = held(mesh)
+    q = pulled(mesh, pins).expand(0, -1, -1)
+    found = dp.as_rigid_as_possible(dp.PoissonSolver(mesh, pins=pins), pins=q)
+    assert found.vertices.shape == (0, mesh.n_vertices, 3)
+    assert found.energies.shape == (0, 2)
+    assert found.moves.tolist() == [0]
+
+
 def test_moves_have_no_gradient():
     mesh = KINDS["plane"]()
     pins = held(mesh)

@@ -57,7 +57,7 @@ def closest_rotation(J: Jacobian) -> Jacobian:
     Of a surface in space, (3, 2): the matrix of orthonormal columns that is closest. Where several
     are closest, the derivative is zero, and Q one of them: in the plane, where the similarity part
     of J vanishes, as it does for a reflection, the identity. In space, derivatives are exact up to
-    third order.
+    third order. NaN where J is not finite.
 
     Raises:
         ValueError: J is not (…, 2, 2), (…, 3, 2) or (…, 3, 3).
@@ -69,9 +69,12 @@ def closest_rotation(J: Jacobian) -> Jacobian:
         # With a third column of zeros. The third of Q is then the normal.
         return nearest_rotation(torch.cat([J, torch.zeros_like(J[..., :1])], dim=-1))[..., :2]
     similarity, _ = similarity_parts(J)
+    size = similarity.detach().abs().amax(-1, keepdim=True)
+    none = size == 0
+    similarity = similarity / torch.where(none, 1, size)  # squares stay within the range
     length = torch.linalg.vector_norm(similarity, dim=-1, keepdim=True)
-    unit = similarity / torch.where(length > 0, length, 1)
-    p, q = torch.where(length > 0, unit, unit.new_tensor([1, 0])).unbind(-1)
+    unit = similarity / torch.where(none, 1, length)
+    p, q = torch.where(none, unit.new_tensor([1, 0]), unit).unbind(-1)
     return torch.stack([p, -q, q, p], dim=-1).unflatten(-1, (2, 2))
 
 

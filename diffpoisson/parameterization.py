@@ -299,7 +299,7 @@ def _embeddings(mesh: Mesh) -> Iterator[Float[Tensor, "n 2"]]:
     half_edges = topology.half_edges(mesh.faces.cpu().numpy())
     i, j = np.concatenate([half_edges, half_edges[:, ::-1]]).T
     n = mesh.n_vertices
-    graph = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    graph = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     boundary = mesh.boundary_loops[0].cpu().numpy()
     depths = csgraph.dijkstra(graph, indices=boundary, unweighted=True, min_only=True)
     sums = depths[i] + depths[j]
@@ -307,9 +307,9 @@ def _embeddings(mesh: Mesh) -> Iterator[Float[Tensor, "n 2"]]:
         if sums.max() * math.log2(pull) < 1000:  # the exponents of double precision end at -1022
             # Only right at interior vertices, whose edges have two faces, one half-edge each way.
             weights = pull**-sums
-            adjacency = sp.coo_matrix((weights, (i, j)), shape=(n, n)).tocsr()
+            adjacency = sp.coo_matrix((weights, (i, j)), shape=(n, n))
             degrees = sp.diags(np.bincount(i, weights, minlength=n))
-            yield _extended_from_circle(mesh, (degrees - adjacency).tocsr())
+            yield _extended_from_circle(mesh, degrees - adjacency)
 
 
 def _mean_energy(mesh: Mesh) -> Callable[[Float[np.ndarray, "n 2"]], float]:

@@ -162,7 +162,7 @@ def _descend(mesh: Mesh, uv: Tensor, epsilon: float, iterations: int) -> Float[T
         point = map_of(x).requires_grad_()
         energy = _energy(mesh, point, epsilon)
         (gradient,) = torch.autograd.grad(energy, point)
-        return float(energy.detach()), (unit * gradient).view(-1).cpu().numpy()
+        return float(energy.detach()), (unit * gradient).flatten().cpu().numpy()
 
     def stop_if_valid(x: np.ndarray) -> None:
         if _worst(mesh, map_of(x)) > 0:
@@ -172,7 +172,7 @@ def _descend(mesh: Mesh, uv: Tensor, epsilon: float, iterations: int) -> Float[T
 
     result = scipy.optimize.minimize(
         value_and_gradient,
-        (uv / unit).view(-1).cpu().numpy(),
+        (uv / unit).flatten().cpu().numpy(),
         jac=True,
         method="L-BFGS-B",
         callback=stop_if_valid,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from diffpoisson.arguments import require_tensor
+from diffpoisson.transforms import without_autocast
 
 
 def restrict(
@@ -46,8 +46,7 @@ def extend(
 
 
 def _product(matrices: Tensor, frames: Tensor) -> Tensor:
-    # Autocast would round geometry to half precision behind the caller's back.
-    with torch.autocast(matrices.device.type, enabled=False):
+    with without_autocast(matrices.device):
         return matrices @ frames.to(matrices.dtype)
 
 

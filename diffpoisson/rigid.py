@@ -36,7 +36,7 @@ class RigidMap(NamedTuple):
         energies: (…, steps) its energy after each step, which never grows but for rounding; in the
             unit of the measures, plus that of the handles.
         moves: (steps - 1,) largest distance by which each further step moved a vertex of any map,
-            as a share of the diagonal of the bounding box of the mesh.
+            as a share of the diagonal of the bounding box of the mesh; without gradients.
     """
 
     vertices: Float[Tensor, "*batch n c"]
@@ -101,7 +101,7 @@ def as_rigid_as_possible(
     dtype = given[0].dtype if given else mesh.dtype
     pins, handles, start = (None if x is None else x.double() for x in (pins, handles, start))
     phi = _start(mesh, given, start)
-    size = torch.linalg.vector_norm(mesh.vertices.amax(0) - mesh.vertices.amin(0))
+    size = _diagonal(mesh)
     batch = torch.broadcast_shapes(*(x.shape[:-2] for x in (*given, phi)))
     energies: list[Tensor] = []
     moves: list[Tensor] = []
@@ -111,8 +111,7 @@ def as_rigid_as_possible(
         previous, phi = phi, solver(rotations, pins=pins, handles=handles)
         energies.append(_energy(solver, phi, handles))
         if step > 0:  # the start need not meet the pins
-            move = torch.linalg.vector_norm((phi - previous).detach(), dim=-1)
-            moves.append(move.amax() / size.to(move))
+            moves.append(_largest_move(previous, phi) / size)
         if tolerance is not None and moves and bool(moves[-1] <= tolerance):
             break
     else:
@@ -134,7 +133,7 @@ def _start(mesh: Mesh, given: list[Tensor], start: Tensor | None) -> Float[Tenso
             f"{c} dimensions; map triangles to the plane or to space, and tetrahedra to space"
         )
     if start is not None:
-        if start.ndim < 2 or start.shape[-2:] != (mesh.n_vertices, c):
+        if start.shape[-2:] != (mesh.n_vertices, c):
             raise ValueError(
                 f"as_rigid_as_possible: expected start of shape (…, n={mesh.n_vertices}, c={c}), "
                 f"got {tuple(start.shape)}"
@@ -146,6 +145,19 @@ def _start(mesh: Mesh, given: list[Tensor], start: Tensor | None) -> Float[Tenso
             "that its positions can't be the start; give one, such as tutte(mesh)"
         )
     return mesh.vertices.double()
+
+
+def _largest_move(
+    before: Float[Tensor, "*batch n c"], after: Float[Tensor, "*#batch n c"]
+) -> Float[Tensor, ""]:
+    """Of any vertex of any map, without a gradient; zero if there are no maps."""
+    moves = torch.linalg.vector_norm((after - before).detach(), dim=-1)
+    return moves.amax() if moves.numel() else moves.new_zeros(())
+
+
+def _diagonal(mesh: Mesh) -> Float[Tensor, ""]:
+    """Of the bounding box."""
+    return torch.linalg.vector_norm(mesh.vertices.amax(0) - mesh.vertices.amin(0))
 
 
 def _give_up(moves: list[Tensor], tolerance: float, max_steps: int) -> None:
@@ -161,9 +173,9 @@ def _energy(
 ) -> Float[Tensor, "*batch"]:
     """That of a map with its own closest rotations."""
     mesh, constraints = solver.mesh, solver.constraints
-    weights = constraints.face_weights.to(phi) * mesh.measures.to(phi)
+    weights = constraints.face_weights * mesh._double_measures
     energy = (weights * arap(jacobians(mesh, phi))).sum(-1)
     if handles is None:
         return energy
     missed = (phi[..., constraints.handles, :] - handles).square().sum(-1)
-    return energy + (constraints.handle_weights.to(phi) * missed).sum(-1)
+    return energy + (constraints.handle_weights * missed).sum(-1)

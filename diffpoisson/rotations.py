@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from diffpoisson.transforms import without_autocast
+
 _STEPS = 2  # k of them give derivatives up to order 2ᵏ - 1
 
 Matrices = Float[Tensor, "*batch 3 3"]
@@ -28,22 +30,22 @@ def nearest_rotation(J: Matrices) -> Matrices:
     like. That is taken to be so where it can't be told from zero in the dtype. NaN where J is not
     finite. Derivatives are exact up to third order.
     """
-    size = J.detach().abs().amax((-2, -1), keepdim=True)
+    size = J.detach().abs().amax((-2, -1), keepdim=True)  # NaN or infinite if any entry is
     J = J / torch.where(size > 0, size, 1)
-    with torch.autocast(J.device.type, enabled=False):  # it would round to half precision
-        Q = _by_singular_vectors(J.detach())
+    with without_autocast(J.device):
+        # LAPACK refuses the whole batch for one NaN.
+        Q = _by_singular_vectors(J.detach().nan_to_num())
+        Q = torch.where(size.isfinite(), Q, torch.nan)
         for _ in range(_STEPS):
             Q = Q @ _cayley(_newton(Q.mT @ J))
     return Q
 
 
 def _by_singular_vectors(J: Matrices) -> Matrices:
-    # LAPACK refuses the whole batch for one NaN.
-    finite = J.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
-    U, _, Vt = torch.linalg.svd(torch.where(finite, J, 0))
-    sign = torch.where(_determinant(U) * _determinant(Vt) < 0, -1, 1).to(J)
-    U = torch.cat([U[..., :2], sign[..., None, None] * U[..., 2:]], dim=-1)
-    return torch.where(finite, U @ Vt, torch.nan)
+    """U diag(1, 1, det UVᵀ) Vᵀ."""
+    U, _, Vt = torch.linalg.svd(J)
+    sign = _determinant(U @ Vt).sign()
+    return torch.cat([U[..., :2], sign[..., None, None] * U[..., 2:]], dim=-1) @ Vt
 
 
 def _newton(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
@@ -58,7 +60,7 @@ def _newton(A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     determinant = (a * cofactors[..., 0, :]).sum(-1)
     # Each entry of K is right to some ten roundings of σ₁, and no eigenvalue is above 2 σ₁: so much
     # may be left of det K = (σ₁ + σ₂)(σ₁ + σ₃)(σ₂ + σ₃) where σ₂ + σ₃ vanishes.
-    largest = K.detach().abs().amax((-2, -1))
+    largest = K.amax((-2, -1))  # of a semidefinite matrix, on the diagonal
     unique = determinant > 30 * torch.finfo(S.dtype).eps * largest**3
     axial = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
     omega = (cofactors @ axial[..., None])[..., 0] / torch.where(unique, determinant, 1)[..., None]

@@ -9,7 +9,7 @@ that uses private torch APIs.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Generic, TypeVar, overload
 
 import torch
@@ -30,6 +30,13 @@ def outside_transforms() -> Iterator[None]:
         forward_ad._set_fwd_grad_enabled(False),
     ):
         yield
+
+
+def without_autocast(device: torch.device) -> AbstractContextManager[Any]:
+    """Autocast off, which would round geometry to half precision behind the caller's back."""
+    if torch.amp.is_autocast_available(device.type):
+        return torch.autocast(device.type, enabled=False)
+    return nullcontext()  # on the meta device
 
 
 class constant_property(Generic[T]):  # noqa: N801  (a decorator, like functools.cached_property)

@@ -5,10 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from tests import checks, constraint_checks, constraint_faults, faults
+from tests import (
+    checks,
+    constraint_checks,
+    constraint_faults,
+    faults,
+    map_checks,
+    map_faults,
+)
 
-CHECKS = checks.CHECKS | constraint_checks.CHECKS
-FAULTS = faults.FAULTS | constraint_faults.FAULTS
+CHECKS = checks.CHECKS | constraint_checks.CHECKS | map_checks.CHECKS
+FAULTS = faults.FAULTS | constraint_faults.FAULTS | map_faults.FAULTS
 
 
 def outcome(check: Callable[[], None]) -> str:
@@ -38,8 +45,9 @@ def table() -> str:
         "# What the tests would notice",
         "",
         f"{len(FAULTS)} mistakes, put one at a time into the real package (`tests/faults.py`,",
-        f"`tests/constraint_faults.py`), against {len(CHECKS)} checks (`tests/checks.py`,",
-        "`tests/constraint_checks.py`). Every mistake is noticed, and every check notices some.",
+        "`tests/constraint_faults.py`, `tests/map_faults.py`), against",
+        f"{len(CHECKS)} checks (`tests/checks.py`, `tests/constraint_checks.py`,",
+        "`tests/map_checks.py`). Every mistake is noticed, and every check notices some.",
         "The customary round trip through the layer's own gradient (check 4) notices",
         f"{noticed['round_trip']}.",
         "",

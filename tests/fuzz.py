@@ -648,7 +648,7 @@ def _rotated(rng: Rng) -> tuple[int, int]:
 
 
 def check_rotations(a: Arguments, Q: Tensor) -> None:
-    """Orthonormal columns; right-handed where square."""
+    """Orthonormal columns, with a symmetric product; right-handed where square."""
     require(Q.shape == a["J"].shape, "shape")
     if not sound(a["J"]):
         return
@@ -656,6 +656,10 @@ def check_rotations(a: Arguments, Q: Tensor) -> None:
     require(((Q.mT @ Q - torch.eye(Q.shape[-1])).abs() < 20 * rounding).all(), "orthonormal")
     if Q.shape[-1] == Q.shape[-2]:
         require((torch.linalg.det(Q) > 0).all(), "right-handed")
+    J = a["J"].double()
+    J = J / J.abs().amax((-2, -1), keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
+    product = Q.mT @ J
+    require(((product - product.mT).abs() < 50 * rounding).all(), "closest")
 
 
 def _draw_rigid(rng: Rng) -> Arguments:
@@ -668,9 +672,9 @@ def _draw_rigid(rng: Rng) -> Arguments:
     return {"solver": solver, kind: images, "tolerance": None, "max_steps": int(rng.integers(1, 4))}
 
 
-def _rigid(**arguments: Any) -> Tensor:
+def _rigid(**arguments: Any) -> dp.RigidMap:
     try:
-        return dp.as_rigid_as_possible(**arguments)
+        return dp.RigidMap(*(x.detach() for x in dp.as_rigid_as_possible(**arguments)))
     except RuntimeError as error:  # a tolerance that a spoilt argument brought in
         require("not converged" in str(error), "an error that says so")
         raise ValueError(str(error)) from error

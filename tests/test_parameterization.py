@@ -13,7 +13,6 @@ from igl import triangle
 
 import diffpoisson as dp
 from diffpoisson.parameterization import (
-    _PULLS,
     _Descent,
     _embeddings,
     _rounded,
@@ -114,22 +113,6 @@ def test_tutte_of_a_deep_tube_pulls_outward(dtype: type, along: int) -> None:
     for uv, holds in ((next(_embeddings(mesh)), False), (tutte(mesh), True)):
         a, b, c = uv.double().numpy()[faces].swapaxes(0, 1)
         assert bool((np.linalg.det(np.stack([b - a, c - a], axis=1)) > 0).all()) is holds
-
-
-def test_embeddings_are_weighted_means() -> None:
-    """By the definition, one vertex at a time."""
-    vertices, faces = meshes.disk(3, 7)
-    mesh = dp.Mesh(vertices, faces)
-    neighbours = {v: np.setdiff1d(faces[(faces == v).any(1)], v) for v in range(len(vertices))}
-    loop = np.asarray(igl.boundary_loop(faces))
-    depth = np.where(np.isin(np.arange(len(vertices)), loop), 0, len(vertices))
-    for _ in depth:
-        depth = np.array([min(depth[v], 1 + depth[neighbours[v]].min()) for v in neighbours])
-    for pull, uv in zip(_PULLS, _embeddings(mesh), strict=True):
-        for v in np.flatnonzero(depth):
-            weights = pull ** -depth[neighbours[v]].astype(float)
-            mean = np.average(uv[neighbours[v]], axis=0, weights=weights)
-            np.testing.assert_allclose(uv[v], mean, atol=1e-12)
 
 
 def test_tutte_gives_up_where_nothing_is_left() -> None:

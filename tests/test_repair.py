@@ -119,6 +119,15 @@ def test_dtype_is_kept():
     assert untangle(mesh, uv.float())[0].dtype == torch.float32
 
 
+def test_strides_do_not_count():
+    """Coordinates one after the other in memory, as a fuzzed call had them."""
+    mesh, solver, uv = spoiled(1, 1.2)
+    strided = uv.mT.contiguous().mT
+    assert not strided.is_contiguous()
+    assert torch.equal(untangle(mesh, strided)[0], untangle(mesh, uv)[0])
+    assert torch.equal(clamp_flips(solver, strided)[0], clamp_flips(solver, uv)[0])
+
+
 # ------------------------------------------------------- untangling
 
 

@@ -62,6 +62,11 @@ def test_autocast_does_not_round():
         assert dp.extend(expected, mesh.frames).dtype == torch.float32
 
 
+def test_without_values_there_is_a_shape():
+    P, frames = (x.to("meta") for x in (field(mesh), mesh.frames))
+    assert dp.restrict(P, frames).shape == (len(P), 3, 2)
+
+
 @pytest.mark.parametrize("shape", [(70, 3), (69, 3, 3), (70, 3, 2)])
 def test_wrong_shapes_raise(shape, unchecked):
     matrices = torch.zeros(shape, dtype=torch.float64)

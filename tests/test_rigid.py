@@ -250,6 +250,78 @@ def test_single_precision_is_the_callers_alone():
     assert_near(found.vertices, double.vertices, 1e-6)
 
 
+@pytest.mark.parametrize("kind", ["pins", "handles"])
+def test_mixed_precision_loses_nothing_in_between(kind):
+    """The dtype of the first given decides what comes out; in between, all is double."""
+    mesh = KINDS["tetrahedra"]()
+    chosen = held(mesh)
+    single = dp.Mesh(mesh.vertices.float(), mesh.faces)
+    rest = dp.Mesh(single.vertices.double(), mesh.faces)
+    q = pulled(mesh, chosen)
+    start = started(mesh, chosen, q).float()
+    options = {"tolerance": None, "max_steps": 4}
+
+    def solved(on, images, start=None):
+        solver = dp.PoissonSolver(on, **{kind: chosen})
+        return dp.as_rigid_as_possible(solver, **{kind: images}, start=start, **options)
+
+    expected = solved(rest, q)
+    found = solved(single, q)
+    for name in ("vertices", "energies"):
+        assert getattr(found, name).dtype == torch.float64
+        assert_near(getattr(found, name), getattr(expected, name), 1e-12)
+    assert_near(found.moves, expected.moves, 1e-6)  # the diagonal is rounded
+    found, expected = solved(mesh, q, start), solved(mesh, q, start.double())
+    assert torch.equal(found.vertices, expected.vertices)
+    rounded = solved(mesh, q.float())
+    expected = solved(mesh, q.float().double())
+    assert torch.equal(rounded.vertices, expected.vertices.float())
+    assert torch.equal(rounded.energies, expected.energies.float())
+
+
+def test_a_start_alone_gives_the_dtype():
+    mesh = dp.Mesh(*meshes.disk(0, 4))
+    solver = dp.PoissonSolver(mesh)
+    start = dp.tutte(mesh)
+    options = {"tolerance": None, "max_steps": 2}
+    assert dp.as_rigid_as_possible(solver, start=start.float(), **options)[0].dtype == torch.float32
+    assert dp.as_rigid_as_possible(solver, **options)[0].dtype == torch.float64
+
+
+def test_batches_of_starts_meet_batches_of_pins():
+    mesh = KINDS["plane"]()
+    pins = held(mesh)
+    solver = dp.PoissonSolver(mesh, pins=pins)
+    q = torch.stack([pulled(mesh, pins, by) for by in (0.1, 0.3, 0.5)])
+    starts = torch.stack([mesh.vertices, -mesh.vertices])[:, None]
+    options = {"tolerance": None, "max_steps": 3}
+    found = dp.as_rigid_as_possible(solver, pins=q, start=starts, **options)
+    assert found.vertices.shape == (2, 3, mesh.n_vertices, 2)
+    for i, j in np.ndindex(2, 3):
+        alone = dp.as_rigid_as_possible(solver, pins=q[j], start=starts[i, 0], **options)
+        assert_near(found.vertices[i, j], alone.vertices, 1e-12)
+        assert_near(found.energies[i, j], alone.energies, 1e-12)
+
+
+def test_of_no_maps_there_are_none():
+    mesh = KINDS["tetrahedra"]()
+    pins = held(mesh)
+    q = pulled(mesh, pins).expand(0, -1, -1)
+    found = dp.as_rigid_as_possible(dp.PoissonSolver(mesh, pins=pins), pins=q)
+    assert found.vertices.shape == (0, mesh.n_vertices, 3)
+    assert found.energies.shape == (0, 2)
+    assert found.moves.tolist() == [0]
+
+
+def test_moves_have_no_gradient():
+    mesh = KINDS["plane"]()
+    pins = held(mesh)
+    q = pulled(mesh, pins).requires_grad_()
+    found = dp.as_rigid_as_possible(dp.PoissonSolver(mesh, pins=pins), pins=q)
+    assert found.vertices.requires_grad
+    assert not found.moves.requires_grad
+
+
 def test_what_floats_stays_at_rest():
     """Of two parts only one is held; the other keeps its shape, where the gauge puts it."""
     mesh = dp.Mesh(*meshes.tetrahedral_parts(0))
@@ -284,6 +356,11 @@ def test_mistakes(unchecked):
         call(solver, pins=q.numpy())
     with pytest.raises(TypeError, match="as_rigid_as_possible"):
         call(solid, pins=q)
+    for given in ({"pins": q.half()}, {"pins": q, "start": solid.vertices.half()}):
+        with pytest.raises(TypeError, match="start must be float32 or float64"):
+            call(solver, **given)
+    with pytest.raises(ValueError, match="handles and start is on meta, the mesh on cpu"):
+        call(solver, pins=q, start=solid.vertices.to("meta"))
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])

@@ -16,6 +16,7 @@ import diffpoisson as dp
 from diffpoisson import flattening
 from tests import meshes
 from tests.checks import assert_near
+from tests.map_checks import winding_strip
 from tests.test_parameterization import references, tube
 from tests.test_repair import spoiled
 
@@ -171,17 +172,6 @@ def test_deep_tubes_do_not_shrink_to_a_point(along, method):
     assert_valid(mesh, uvmap)
     assert uvmap.method == method
     assert uvmap.energy < 3 * along  # each ring must be laid out around the others
-
-
-def winding_strip(turns: float, size: int = 24) -> dp.Mesh:
-    """A ring's strip that climbs as it winds: flat, it would cover itself."""
-    angle, radius = np.meshgrid(
-        np.linspace(0, 2 * np.pi * turns, size), [0.3, 0.65, 1.0], indexing="ij"
-    )
-    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.02 * angle], axis=-1)
-    grid = np.arange(3 * size).reshape(size, 3)
-    a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    return dp.Mesh(vertices.reshape(-1, 3), np.r_[np.c_[a, b, c], np.c_[a, c, d]])
 
 
 def test_overlaps_are_kept_off_at_a_price():

@@ -291,8 +291,11 @@ class NJFTraining(lightning.LightningModule):
             raise ValueError(
                 f"NJFTraining: samples are trained by the paper's loss alone, not {self.objective}"
             )
-        points = cells.points[:, None]  # one cloud for all targets of a shape
-        code = self.model.encode(points, cells.target_points, cells.parameters)
+        if cells.partners is not None:
+            code = self.model.encode_pairs(cells.points, cells.partners)
+        else:
+            points = cells.points[:, None]  # one cloud for all targets of a shape
+            code = self.model.encode(points, cells.target_points, cells.parameters)
         loss = sampled_loss(self.model.at(cells, code), cells.target)
         size = code.shape[:2].numel()
         self.log(

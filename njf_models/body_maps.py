@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -296,7 +296,8 @@ def pair_loader(
 ) -> DataLoader[Cells]:
     """Cells of maps among so many sources a step, by `paired_cells`, shuffled."""
     collate = partial(paired_cells, kind=kind, n_cells=n_cells, n_targets=n_targets)
-    n, posed = min(n_sources, len(maps)), PosedBodies(maps)
+    n = min(n_sources, len(maps))
+    posed: Dataset[Any] = PosedBodies(maps)
     return DataLoader(posed, batch_size=n, shuffle=True, drop_last=True, collate_fn=collate)
 
 

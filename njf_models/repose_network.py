@@ -51,12 +51,12 @@ class PreparedBody(NamedTuple):
 
     Attributes:
         shape: with its factor and features.
-        points: (s, f) what the encoder sees.
+        code: (z,) what the encoder makes of its surface.
         centre: (3,) area-weighted mean of the surface.
     """
 
     shape: Shape
-    points: Float[Tensor, "s f"]
+    code: Float[Tensor, "z"]
     centre: Float[Tensor, "3"]
 
 
@@ -88,8 +88,9 @@ class ReposeNetwork:
         """
         return self.repose_prepared(self.prepare(mesh), poses).to(mesh.dtype)
 
+    @torch.no_grad()
     def prepare(self, mesh: dp.Mesh) -> PreparedBody:
-        """What depends on the body alone: factor, features and points."""
+        """What depends on the body alone: factor, features and code."""
         mesh = mesh.to(torch.float64)
         solver, wks = dp.PoissonSolver(mesh), None
         if self.inputs.n_energies:
@@ -98,14 +99,16 @@ class ReposeNetwork:
         samples = dp.sample_surface(mesh, self.inputs.n_points, generator=generator)
         points = point_features(mesh, samples, wks).float()
         centre = mesh.vertex_areas @ mesh.vertices / mesh.areas.sum()
-        return PreparedBody(Shape.prepare(mesh, wks, solver=solver), points, centre)
+        assert self.model.encoder is not None
+        code = self.model.encoder(points[None])[0]
+        return PreparedBody(Shape.prepare(mesh, wks, solver=solver), code, centre)
 
     @torch.no_grad()
     def repose_prepared(
         self, body: PreparedBody, poses: Float[Tensor, "p k"]
     ) -> Float[Tensor, "p n 3"]:
         """A body that was prepared before, in other poses; float64."""
-        code = self.model.encode(body.points[None], parameters=poses.float())
+        code = torch.cat([body.code.expand(len(poses), -1), poses.float()], dim=-1)
         return self.model(body.shape, code).vertices.double() + body.centre
 
     # ---------------------------------------------------------------- files

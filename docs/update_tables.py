@@ -354,7 +354,10 @@ def repose() -> str:
 def spent_on(cost: dict) -> str:
     """Steps and time of a training of `examples/body_maps.py`."""
     steps = " and ".join(f"{n:,} {phase}" for phase, n in cost["steps"].items())
-    return f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+    spent = f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+    if seconds := cost.get("cages, cpu seconds"):
+        spent += f", and {seconds / 60:.1f} for the cages of the training bodies before it"
+    return spent
 
 
 def body_tasks() -> str:
@@ -393,6 +396,15 @@ def far_bodies() -> str:
     for name, row in results.items():
         cells = [number(row[column]) for column in columns]
         lines.append(f"| {name} | {row['maps']:.0f} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def repose_rate() -> str:
+    """Maps per second of the shipped network, from `tests/benchmarks/repose_rate.py`."""
+    lines = ["| triangles | preparation, ms | a map, ms | maps per second |", "|---" * 4 + "|"]
+    for row in json.loads((RESULTS / "repose_rate.json").read_text())["meshes"]:
+        cells = [1000 * row["preparation, s"], row["a map, ms"], row["maps per second"]]
+        lines.append(f"| {row['faces']:,} | {' | '.join(map(number, cells))} |")
     return "\n".join(lines)
 
 
@@ -670,6 +682,7 @@ TABLES = {
     "repose": repose,
     "body_tasks": body_tasks,
     "far_bodies": far_bodies,
+    "repose_rate": repose_rate,
     "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,

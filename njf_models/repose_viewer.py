@@ -75,7 +75,7 @@ class ReposeViewer(Window):
             host,
             port,
             up="+z",
-            camera=(0.45, -1.1, 0.15),  # from the front, a little from its left
+            camera=(0.36, -0.86, 0.12),  # from the front, a little from its left
         )
         self.sliders: list[tuple[Freedom, Any]] = []
         self._add_controls(title)

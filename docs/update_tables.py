@@ -355,6 +355,8 @@ def spent_on(cost: dict) -> str:
     """Steps and time of a training of `examples/body_maps.py`."""
     steps = " and ".join(f"{n:,} {phase}" for phase, n in cost["steps"].items())
     spent = f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+    if seconds := cost.get("earlier, cpu seconds"):
+        spent += f", after {seconds / 60:.1f} of earlier trainings"
     if seconds := cost.get("cages, cpu seconds"):
         spent += f", and {seconds / 60:.1f} for the cages of the training bodies before it"
     return spent
@@ -643,8 +645,9 @@ def counterpart(row: Row) -> list[str]:
         cells = ratio(summary[ours][row.quantity], summary[theirs][row.quantity])
     elif row.baseline:
         cells[1] = "not yet"
-    cost = results.get("training", {}).get(ours, {}).get("cpu seconds")
-    minutes = results.get("minutes") if cost is None else cost / 60
+    cost = results.get("training", {}).get(ours, {})
+    seconds = cost.get("cpu seconds", 0) + cost.get("earlier, cpu seconds", 0)
+    minutes = seconds / 60 if seconds else results.get("minutes")
     return [*cells, "–" if minutes is None else number(minutes)]
 
 

@@ -80,7 +80,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     for kind in options.models:
         title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
-        costs[title] = {"steps": steps[kind], **cost(checkpoint)}
+        costs[title] = {"steps": steps[kind], **cost(checkpoint), **earlier(title, options.init)}
         records[title], maps[title] = evaluate_maps(
             load_checkpoint(checkpoint), maps_of(test, options)
         )
@@ -309,6 +309,15 @@ def cost(checkpoint: Path) -> dict[str, float | None]:
     cages = checkpoint.parents[1] / "cages.json"
     before = json.loads(cages.read_text()) if cages.exists() else {}
     return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"], **before}
+
+
+def earlier(title: str, init: Path | None) -> dict[str, float]:
+    """The CPU time of the trainings that this one was begun with, if there are any on record."""
+    if init is None or not (init / "results.json").exists():
+        return {}
+    before = json.loads((init / "results.json").read_text())["training"][title]
+    key = "earlier, cpu seconds"
+    return {key: before["cpu seconds"] + before.get(key, 0.0)}
 
 
 def unmoved(options: argparse.Namespace, test: BodyStore) -> list[MapRecord]:

@@ -411,7 +411,12 @@ def repose() -> str:
 def spent_on(cost: dict) -> str:
     """Steps and time of a training of `examples/body_maps.py`."""
     steps = " and ".join(f"{n:,} {phase}" for phase, n in cost["steps"].items())
-    return f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+    spent = f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
+    if seconds := cost.get("earlier, cpu seconds"):
+        spent += f", after {seconds / 60:.1f} of earlier trainings"
+    if seconds := cost.get("cages, cpu seconds"):
+        spent += f", and {seconds / 60:.1f} for the cages of the training bodies before it"
+    return spent
 
 
 def body_tasks() -> str:
@@ -450,6 +455,15 @@ def far_bodies() -> str:
     for name, row in results.items():
         cells = [number(row[column]) for column in columns]
         lines.append(f"| {name} | {row['maps']:.0f} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def repose_rate() -> str:
+    """Maps per second of the shipped network, from `tests/benchmarks/repose_rate.py`."""
+    lines = ["| triangles | preparation, ms | a map, ms | maps per second |", "|---" * 4 + "|"]
+    for row in json.loads((RESULTS / "repose_rate.json").read_text())["meshes"]:
+        cells = [1000 * row["preparation, s"], row["a map, ms"], row["maps per second"]]
+        lines.append(f"| {row['faces']:,} | {' | '.join(map(number, cells))} |")
     return "\n".join(lines)
 
 
@@ -688,8 +702,9 @@ def counterpart(row: Row) -> list[str]:
         cells = ratio(summary[ours][row.quantity], summary[theirs][row.quantity])
     elif row.baseline:
         cells[1] = "not yet"
-    cost = results.get("training", {}).get(ours, {}).get("cpu seconds")
-    minutes = results.get("minutes") if cost is None else cost / 60
+    cost = results.get("training", {}).get(ours, {})
+    seconds = cost.get("cpu seconds", 0) + cost.get("earlier, cpu seconds", 0)
+    minutes = seconds / 60 if seconds else results.get("minutes")
     return [*cells, "–" if minutes is None else number(minutes)]
 
 
@@ -727,6 +742,7 @@ TABLES = {
     "repose": repose,
     "body_tasks": body_tasks,
     "far_bodies": far_bodies,
+    "repose_rate": repose_rate,
     "triangulations": triangulations,
     "data_cost": data_cost,
     "uv": uv,

@@ -24,13 +24,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import platform
 import time
-import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, replace
-from itertools import cycle
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +36,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
+from njf_models.baselines.cages import CageDeformation
 from njf_models.body_maps import (
     TASKS,
     BodyCells,
@@ -47,13 +45,21 @@ from njf_models.body_maps import (
     body_loader,
     cell_loader,
     evaluate_maps,
+    pair_loader,
     summarise,
 )
 from njf_models.body_report import BodyRow, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
 from njf_models.evaluation import format_table
+from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.models import MODELS
-from njf_models.training import NJFTraining, Phase, fit_phases, load_checkpoint
+from njf_models.training import (
+    NJFTraining,
+    Phase,
+    fit_phases,
+    last_checkpoint,
+    load_checkpoint,
+)
 
 KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
 PAPER = {"bodies": 2000, "poses": 32, "code_size": 1000, "points": 1024, "targets": 32}
@@ -63,8 +69,7 @@ LEARNING_RATE = 2e-3
 def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     options = parse(argv)
     options.out.mkdir(parents=True, exist_ok=True)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # no advertisements
-    warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+    quiet()
 
     train, validation, test = make_bodies(options)
     steps = plan(train, options)
@@ -72,7 +77,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     for kind in options.models:
         title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
-        costs[title] = {"steps": steps[kind], **cost(checkpoint)}
+        costs[title] = {"steps": steps[kind], **cost(checkpoint), **earlier(title, options.init)}
         records[title], maps[title] = evaluate_maps(
             load_checkpoint(checkpoint), maps_of(test, options)
         )
@@ -81,11 +86,7 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     table |= {title: summarise(of_model) for title, of_model in records.items()}
     print("\nUnseen bodies and poses:\n" + format_table(table))
     results = {
-        "options": {
-            name: value for name, value in vars(options).items() if not isinstance(value, Path)
-        },
-        "torch": torch.__version__,
-        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        **circumstances(options),
         "training": costs,
         "summary": table,
     }
@@ -183,12 +184,18 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
     )
 
 
-def loaders(kind: str, train: BodyStore, options: argparse.Namespace) -> dict[str, DataLoader[Any]]:
+def loaders(
+    kind: str, train: BodyStore | list[Body], options: argparse.Namespace
+) -> dict[str, DataLoader[Any]]:
     """What each phase of a training sees."""
     maps = maps_of(train, options, training=True)
     phases: dict[str, DataLoader[Any]] = {}
     samples = MODELS[kind].samples
-    if samples is not None:
+    if samples is not None and maps.task.others:
+        phases["sampled"] = pair_loader(
+            maps, samples, options.cells, options.per_step, options.targets
+        )
+    elif samples is not None:
         phases["sampled"] = cell_loader(BodyCells(maps, samples, options.cells), options.per_step)
     return phases | {"whole": body_loader(maps, shuffle=True)}
 
@@ -218,13 +225,19 @@ def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, dict[str, i
 
 
 def seconds_per_step(kind: str, train: BodyStore, options: argparse.Namespace) -> dict[str, float]:
-    """CPU time of a step of each phase, the median of some."""
+    """CPU time of a step of each phase, the median of some; without what is made once for a body.
+
+    That is its factor, and its cage if the model has cages.
+    """
     module = make_module(kind, 1, options)
     optimizer = torch.optim.Adam(module.parameters())
+    few = [train[i] for i in range(min(len(train), options.per_step))]
     seconds = {}
-    for phase, loader in loaders(kind, train, options).items():
+    for phase, loader in loaders(kind, few, options).items():
+        for batch in islice(loader, options.per_step):
+            module.training_step(batch, 0)
         times = []
-        batches: Iterator[Any] = iter(cycle(loader))
+        batches: Iterator[Any] = repeated(loader)
         for _ in range(11):
             start = time.process_time()
             optimizer.zero_grad()
@@ -233,6 +246,12 @@ def seconds_per_step(kind: str, train: BodyStore, options: argparse.Namespace) -
             times.append(time.process_time() - start)
         seconds[phase] = float(np.median(times))
     return seconds
+
+
+def repeated(loader: DataLoader[Any]) -> Iterator[Any]:
+    """Batches of one pass after another, each drawn anew."""
+    while True:
+        yield from loader
 
 
 def fit(
@@ -249,20 +268,48 @@ def fit(
         module.model.load_state_dict(other.state_dict())
     ends = dict(zip(steps, np.cumsum(list(steps.values())).tolist(), strict=True))
     total = ends["whole"]
+    data = loaders(kind, train, options)
+    if isinstance(module.model, CageDeformation) and steps_done(options.out / kind) < total:
+        make_cages(module.model, data["whole"].dataset, options.out / kind / "cages.json")
     fit_phases(
         module,
         options.out / kind,
-        [Phase(data, ends[phase]) for phase, data in loaders(kind, train, options).items()],
+        [Phase(batches, ends[phase]) for phase, batches in data.items()],
         body_loader(maps_of(validation, options)),
         validate_every=total // options.validations,
     )
     return options.out / kind / "checkpoints" / "best.ckpt"
 
 
+def steps_done(folder: Path) -> int:
+    """Of a training, until now."""
+    checkpoint = last_checkpoint(folder)
+    return torch.load(checkpoint, weights_only=False)["global_step"] if checkpoint else 0
+
+
+def make_cages(model: CageDeformation, maps: Any, path: Path) -> None:
+    """The cages of all sources, ahead of the training; and a file with the CPU time of that."""
+    start = time.process_time()
+    for index in range(len(maps)):
+        model.prepare(maps.source(index).shape)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"cages, cpu seconds": time.process_time() - start}))
+
+
 def cost(checkpoint: Path) -> dict[str, float | None]:
-    """What the training until the last step took."""
-    last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
-    return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
+    """What the training took, and the cages before it."""
+    cages = checkpoint.parents[1] / "cages.json"
+    before = json.loads(cages.read_text()) if cages.exists() else {}
+    return training_cost(checkpoint) | before
+
+
+def earlier(title: str, init: Path | None) -> dict[str, float]:
+    """The CPU time of the trainings that this one was begun with, if there are any on record."""
+    if init is None or not (init / "results.json").exists():
+        return {}
+    before = json.loads((init / "results.json").read_text())["training"][title]
+    key = "earlier, cpu seconds"
+    return {key: before["cpu seconds"] + before.get(key, 0.0)}
 
 
 def unmoved(options: argparse.Namespace, test: BodyStore) -> list[MapRecord]:

@@ -5,8 +5,10 @@ coarse triangulation. The built-in bodies have parameters outside of the range o
 triangulation of the original, with face, fingers and toes; their maps are compared with the body
 model's own. A character of yours, `--mesh FILE`, has no such reference; its maps are drawn.
 
-It must stand as the training bodies do, with arms half lowered, in metres: x to its left, y to its
-back, z up. `--y-up` turns one whose y is up and whose z is to its front; `--height` scales it.
+It should stand as the training bodies do, with arms half lowered, in metres: x to its left, y to
+its back, z up. `--y-up` turns one whose y is up and whose z is to its front; `--height` scales it.
+One that stands otherwise, with its arms held out say, needs a network for any pose: `--run` of a
+run of `body_maps.py --task any-pose`.
 
 Takes a minute, and more when the body model is built for the first time. Writes to the folder
 `--out`: far.png, far.json, and the first re-posed character as an OBJ.
@@ -123,10 +125,8 @@ def own_character(
     mesh = dp.Mesh(stance.standing(character.vertices), character.faces)
     posed = network.repose(mesh, poses)
     write_obj(options.out / "far.obj", stance.back(posed[0]), mesh.faces)
-    return [
-        BodyRow(f"pose {i}", mesh.faces, mesh.vertices, None, {"ours": phi})
-        for i, phi in enumerate(posed[:4])
-    ]
+    maps = {f"pose {i}": phi for i, phi in enumerate(posed[:4])}
+    return [BodyRow("", mesh.faces, mesh.vertices, None, maps)]
 
 
 def write_obj(path: Path, vertices: Tensor, faces: Tensor) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -118,6 +118,7 @@ class BodyMaps(Dataset[Batch]):
         if self.task.others and len(bodies) < 2:
             raise ValueError("BodyMaps: maps to other bodies need two of them at least")
         self._n_poses = len(bodies[0].poses)
+        self._body = lru_cache(maxsize=_KEPT_SOURCES)(bodies.__getitem__)  # a store reads files
         self._kept_source = lru_cache(maxsize=_KEPT_SOURCES)(self._make_source)
 
     def __len__(self) -> int:
@@ -163,8 +164,13 @@ class BodyMaps(Dataset[Batch]):
             target_points=targets.points,
         )
 
+    def posed_points(self, index: int) -> PosedPoints:
+        """A source, and the points that the encoder sees of it."""
+        source = self.source(index)
+        return PosedPoints(source, self._points(source.mesh, source.wks, index))
+
     def _make_source(self, index: int) -> Source:
-        body = self.bodies[index // max(1, self.task.sources)]
+        body = self._body(index // max(1, self.task.sources))
         pose = index % self.task.sources if self.task.sources else None
         vertices = body.rest if pose is None else body.posed[pose]
         whole = dp.Mesh(vertices.double(), body.faces)
@@ -175,7 +181,7 @@ class BodyMaps(Dataset[Batch]):
 
     def _targets(self, index: int) -> _Targets:
         numbers = self.targets(index).tolist()
-        bodies = {body: self.bodies[body] for body in {body for body, _ in numbers}}
+        bodies = {body: self._body(body) for body in {body for body, _ in numbers}}
         vertices = torch.stack([bodies[body].posed[pose] for body, pose in numbers])
         if self.task.told == "pose":
             parameters = torch.stack([bodies[body].poses[pose] for body, pose in numbers])
@@ -216,6 +222,65 @@ class BodyCells(Dataset[Cells]):
         return self.maps.cells(index, self.kind, self.n_cells)
 
 
+class PosedPoints(NamedTuple):
+    """A source that is a target of others, too.
+
+    Attributes:
+        source: the body in its pose.
+        points: (s, f) what the encoder sees of it.
+    """
+
+    source: Source
+    points: Float[Tensor, "s f"]
+
+
+class PosedBodies(Dataset[PosedPoints]):
+    """The sources of maps, to be each other's targets.
+
+    Args:
+        maps: whose sources, all of them whole.
+
+    Raises:
+        ValueError: pieces are cut away, so that vertices of one are not those of another.
+    """
+
+    def __init__(self, maps: BodyMaps) -> None:
+        if maps.task.pieces:
+            raise ValueError("PosedBodies: bodies with pieces cut away are no targets of others")
+        self.maps = maps
+
+    def __len__(self) -> int:
+        return len(self.maps)
+
+    def __getitem__(self, index: int) -> PosedPoints:
+        return self.maps.posed_points(index)
+
+
+def paired_cells(
+    posed: Sequence[PosedPoints], kind: CellKind, n_cells: int, n_targets: int
+) -> Cells:
+    """Random cells of maps among some bodies, each a source and a target of as many others.
+
+    A body is encoded once for all maps from it and to it, so that a step has many more maps than
+    points to encode.
+
+    Args:
+        posed: the bodies.
+        kind: faces or vertices, as the model wants.
+        n_cells: how many of each source.
+        n_targets: of each source; all others, if they are fewer.
+    """
+    n = len(posed)
+    steps = 1 + torch.randperm(n - 1)[:n_targets]  # round to any but itself
+    partners = (torch.arange(n)[:, None] + steps) % n
+    x = torch.stack([body.source.mesh.vertices.float() for body in posed])
+    cells = [
+        Cells.draw(kind, n_cells, source.mesh, source.wks, x[others], points=points)
+        for (source, points), others in zip(posed, partners, strict=True)
+    ]
+    return replace(Cells.stack(cells), partners=partners)
+
+
 def body_loader(maps: BodyMaps, *, shuffle: bool = False) -> DataLoader[Batch]:
     """One body a step. Factors live in this process, so there are no workers."""
     return DataLoader(maps, batch_size=None, shuffle=shuffle)
@@ -225,6 +290,16 @@ def cell_loader(cells: BodyCells, n_sources: int) -> DataLoader[Cells]:
     """Cells of so many sources a step, shuffled; of all, if there are fewer."""
     n = min(n_sources, len(cells))
     return DataLoader(cells, batch_size=n, shuffle=True, drop_last=True, collate_fn=Cells.stack)
+
+
+def pair_loader(
+    maps: BodyMaps, kind: CellKind, n_cells: int, n_sources: int, n_targets: int
+) -> DataLoader[Cells]:
+    """Cells of maps among so many sources a step, by `paired_cells`, shuffled."""
+    collate = partial(paired_cells, kind=kind, n_cells=n_cells, n_targets=n_targets)
+    n = min(n_sources, len(maps))
+    posed: Dataset[Any] = PosedBodies(maps)
+    return DataLoader(posed, batch_size=n, shuffle=True, drop_last=True, collate_fn=collate)
 
 
 # -------------------------------------------------------------------- evaluation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from njf_models.pointnet import PointNet
@@ -64,3 +64,20 @@ class CodedModel(nn.Module):
                 f"got {code.shape[-1]}; check the number of parameters"
             )
         return code
+
+    def encode_pairs(
+        self, points: Float[Tensor, "b s f"], partners: Int[Tensor, "b t"]
+    ) -> Float[Tensor, "b t z"]:
+        """The codes of maps among b shapes, each of which is encoded once.
+
+        Args:
+            points: (b, s, f) point features of the shapes.
+            partners: (b, t) which of them the targets of each are.
+
+        Raises:
+            ValueError: the model's code is not [source code | target code].
+        """
+        if self.encoder is None or not self.encodes_target:
+            raise ValueError("encode_pairs: this needs a model that encodes source and target")
+        codes = self.encoder(points)
+        return torch.cat([codes[:, None].expand(-1, partners.shape[1], -1), codes[partners]], -1)

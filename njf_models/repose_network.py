@@ -10,6 +10,7 @@ from torch import Tensor
 
 import diffpoisson as dp
 from njf_models.features import Shape
+from njf_models.njf import NeuralJacobianField
 from njf_models.trained import TrainedNetwork
 
 
@@ -45,12 +46,12 @@ class PreparedBody(NamedTuple):
 
     Attributes:
         shape: with its factor and features.
-        points: (s, f) what the encoder sees.
+        code: (z,) what the encoder makes of its surface.
         centre: (3,) area-weighted mean of the surface.
     """
 
     shape: Shape
-    points: Float[Tensor, "s f"]
+    code: Float[Tensor, "z"]
     centre: Float[Tensor, "3"]
 
 
@@ -72,17 +73,20 @@ class ReposeNetwork(TrainedNetwork):
         """
         return self.repose_prepared(self.prepare(mesh), poses).to(mesh.dtype)
 
+    @torch.no_grad()
     def prepare(self, mesh: dp.Mesh) -> PreparedBody:
-        """What depends on the body alone: factor, features and points."""
+        """What depends on the body alone: factor, features and code."""
         mesh = mesh.to(torch.float64)
         shape, points = self.inputs.of(mesh)
         centre = mesh.vertex_areas @ mesh.vertices / mesh.areas.sum()
-        return PreparedBody(shape, points, centre)
+        assert isinstance(self.model, NeuralJacobianField)
+        assert self.model.encoder is not None
+        return PreparedBody(shape, self.model.encoder(points[None])[0], centre)
 
     @torch.no_grad()
     def repose_prepared(
         self, body: PreparedBody, poses: Float[Tensor, "p k"]
     ) -> Float[Tensor, "p n 3"]:
         """A body that was prepared before, in other poses; float64."""
-        code = self.model.encode(body.points[None], parameters=poses.float())
+        code = torch.cat([body.code.expand(len(poses), -1), poses.float()], dim=-1)
         return self.model(body.shape, code).vertices.double() + body.centre

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 import diffpoisson as dp
@@ -32,6 +32,8 @@ class Cells:
         frames: (k, 3, 2) tangent bases of faces; None for vertices.
         target_points: (t, s, f) point features of the targets, if the code is made from them.
         parameters: (t, p) parameters of the targets, if they have any.
+        partners: (b, t) which of the b shapes the targets are, if each is source and target: their
+            points are then those of the sources, encoded once.
     """
 
     features: Float[Tensor, "*b k f"]
@@ -40,6 +42,7 @@ class Cells:
     frames: Float[Tensor, "*b k 3 2"] | None = None
     target_points: Float[Tensor, "*b t s f"] | None = None
     parameters: Float[Tensor, "*b t p"] | None = None
+    partners: Int[Tensor, "b t"] | None = None
 
     @classmethod
     def draw(

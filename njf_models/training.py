@@ -25,6 +25,7 @@ from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
+from njf_models.encoding import CodedModel
 from njf_models.features import Motions, Shape, point_features
 from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss, sampled_loss
 from njf_models.metrics import count_flips
@@ -270,8 +271,7 @@ class NJFTraining(lightning.LightningModule):
             raise ValueError(
                 f"NJFTraining: samples are trained by the paper's loss alone, not {self.objective}"
             )
-        points = cells.points[:, None]  # one cloud for all targets of a shape
-        code = self.model.encode(points, cells.target_points, cells.parameters)
+        code = encoded_cells(self.model, cells)
         loss = sampled_loss(self.model.at(cells, code), cells.target)
         size = code.shape[:2].numel()
         self.log(
@@ -346,6 +346,20 @@ class NJFTraining(lightning.LightningModule):
 def encoded(model: Model, batch: Batch) -> Float[Tensor, "*t z"]:
     """The codes of a batch's maps."""
     return model.encode(batch.points, batch.target_points, batch.parameters)
+
+
+def encoded_cells(model: Model, cells: Cells) -> Float[Tensor, "b t z"]:
+    """The codes of the maps of samples; a shape that is source and target is encoded once.
+
+    Raises:
+        ValueError: there are such, and the model doesn't encode source and target alike.
+    """
+    if cells.partners is None:
+        points = cells.points[:, None]  # one cloud for all targets of a shape
+        return model.encode(points, cells.target_points, cells.parameters)
+    if not isinstance(model, CodedModel):
+        raise ValueError(f"encoded_cells: {type(model).__name__} does not learn maps among shapes")
+    return model.encode_pairs(cells.points, cells.partners)
 
 
 def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Example]:

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import threading
-from types import TracebackType
-from typing import Any
-
 import matplotlib as mpl
 import numpy as np
 import torch
@@ -22,13 +16,13 @@ import diffpoisson as dp
 from njf_models.meshfiles import checker_picture
 from njf_models.posing import Kind, PosedMesh, hit_vertex
 from njf_models.pretrained import parameterize
+from njf_models.window import Window
 
 _AT_REST = 1e-4  # of the diagonal: moves that no one sees end the following
-_SURFACE = (150, 175, 205)
 _SQUARES = 32  # of the checkerboard, along the unit square
 
 
-class Viewer:
+class Viewer(Window):
     """A page that shows a mesh, and moves it with its handles.
 
     Args:
@@ -46,30 +40,10 @@ class Viewer:
     ) -> None:
         self.pose = PosedMesh(mesh)
         self._faces = mesh.faces.numpy()
-        self._lock = threading.Lock()  # of the pose: viser calls from threads of its own
-        self._changed, self._closed = threading.Event(), threading.Event()
         self._gizmos: dict[str, viser.TransformControlsHandle] = {}
-        with _silence():
-            self._server = viser.ViserServer(host, port, label=f"njf view: {title}", verbose=False)
-        self._server.scene.set_up_direction("+y")
-        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
-        self._server.gui.main_panel.dock_right()
-        self._surface = self._drawn()
+        super().__init__(f"njf view: {title}", self.pose.vertices, mesh.faces, host, port)
+        self._surface.on_click(self._clicked)
         self._add_controls(title)
-        self._aim(self.pose.vertices)
-
-    @property
-    def address(self) -> str:
-        """Of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
-
-    def serve(self) -> None:
-        """Let the surface follow its handles until `close`, or an interrupt."""
-        while not self._closed.is_set():
-            self._changed.wait(timeout=0.2)  # so that an interrupt is heard
-            if self._changed.is_set():
-                self._changed.clear()
-                self.follow()
 
     def follow(self) -> None:
         """One step of the surface; the next one is due until it rests."""
@@ -82,23 +56,6 @@ class Viewer:
             f"{self.pose.mesh.n_vertices:,} vertices, {self.pose.mesh.n_faces:,} triangles, "
             f"{len(self.pose.handles)} handles"
         )
-
-    def close(self) -> None:
-        """End the page."""
-        self._closed.set()
-        with _silence():
-            self._server.stop()
-
-    def __enter__(self) -> Viewer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     # ---------------------------------------------------------------- handles
 
@@ -158,17 +115,6 @@ class Viewer:
 
     # ---------------------------------------------------------------- the page
 
-    def _drawn(self) -> viser.MeshHandle:
-        surface = self._server.scene.add_mesh_simple(
-            "/surface",
-            self.pose.vertices.numpy().astype(np.float32),
-            self._faces.astype(np.uint32),
-            color=_SURFACE,
-            side="double",
-        )
-        surface.on_click(self._clicked)
-        return surface
-
     def _add_controls(self, title: str) -> None:
         gui = self._server.gui
         gui.add_markdown(f"**{title}**\n\nClick on the surface to add a handle; drag it.")
@@ -183,16 +129,6 @@ class Viewer:
         def _(_: object) -> None:
             self.pose.kind = kind.value
             self._changed.set()
-
-    def _aim(self, shown: Float[Tensor, "k 3"]) -> None:
-        """The cameras, also of browsers to come: a little from above, all of it in sight."""
-        low, high = shown.amin(0).numpy(), shown.amax(0).numpy()
-        middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-        clients = self._server.get_clients().values()
-        cameras: list[Any] = [self._server.initial_camera, *(client.camera for client in clients)]
-        for camera in cameras:
-            camera.position = middle + size * np.array([0.3, 0.4, 1.1])
-            camera.look_at = middle
 
     # ---------------------------------------------------------------- UV map
 
@@ -213,11 +149,6 @@ class Viewer:
         self._server.scene.add_mesh_trimesh("/textured", _textured(uvmap))
         self._server.scene.add_mesh_trimesh("/layout", _coloured(uvmap, layout))
         self._aim(torch.cat([mesh.vertices, layout]))
-
-
-def _silence() -> contextlib.AbstractContextManager[object]:
-    """viser announces itself on the standard output, whatever it is asked."""
-    return contextlib.redirect_stdout(io.StringIO())
 
 
 def _beside(vertices: Float[Tensor, "n 3"], uv: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:

@@ -86,6 +86,10 @@ class CageDeformation(WholeShapes, CodedModel):
         """The one map; for training as of a model with rounds."""
         return [self(shape, code)]
 
+    def prepare(self, shape: Shape) -> None:
+        """Make the cage of a shape now, which its first map would; it is kept with the shape."""
+        self._cage(shape)
+
     def _cage(self, shape: Shape) -> _Cage:
         mesh = shape.mesh
         if mesh.n_parts > 1:

@@ -12,6 +12,9 @@ from njf_models.commands import CommandError, UsageError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    import diffpoisson as dp
+    from njf_models.repose_network import ReposeNetwork, Stance
+
 _DESCRIPTION = """\
 Put a human character into another pose, without skeleton and skinning weights: a network predicts
 what the pose does to each triangle. The character stands with half-lowered arms, as in the picture
@@ -23,9 +26,11 @@ examples:
   njf repose body.obj sitting.obj --pose sitting.json
   njf repose body.obj nod.obj --joint head 20 0 0 --joint neck01 10 0 0
   njf repose scan.glb some.obj --random 7 --y-up --height 1.75
+  njf repose body.obj posed.obj --view
 
 A pose file is a JSON object: joints and their rotation vectors in degrees, {"head": [20, 0, 0]},
-about x, to the left, y, to the back, and z, up; other joints stay.
+about x, to the left, y, to the back, and z, up; other joints stay. --view serves a page
+with a slider for each angle; OUTPUT, which its button writes, may be left out then.
 """
 
 
@@ -40,30 +45,35 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("input", type=Path, metavar="INPUT", help="obj, ply, off, stl or glb file")
-    add("output", type=Path, metavar="OUTPUT", help="obj file to write")
+    add("output", type=Path, nargs="?", metavar="OUTPUT", help="obj file to write")
     pose = parser.add_mutually_exclusive_group(required=True)
     pose.add_argument("--pose", type=Path, metavar="FILE", help="JSON file of joints")
     pose.add_argument(
         "--joint", nargs=4, action="append", metavar=("NAME", "X", "Y", "Z"), help="turn a joint"
     )
     pose.add_argument("--random", type=int, metavar="SEED", help="a random pose")
+    pose.add_argument("--view", action="store_true", help="turn the joints in the browser")
+    add("--port", type=int, default=8080, help="of the page of --view (8080)")
+    add("--host", default="127.0.0.1", help="who may look (127.0.0.1: only you)")
     add("--y-up", action="store_true", help="y is up and z to the front; by default z is up")
     add("--height", type=float, metavar="M", help="of the character, if its unit is not the metre")
     return parser
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the posed character."""
+    """Write the posed character, or show it."""
     import diffpoisson as dp  # noqa: PLC0415  (slow imports)
     from njf_models.meshfiles import MeshFileError, read_mesh_file  # noqa: PLC0415
     from njf_models.pretrained import load_pretrained  # noqa: PLC0415
     from njf_models.repose_network import Stance  # noqa: PLC0415
 
-    if options.output.suffix.lower() != ".obj":
+    if options.output is None and not options.view:
+        raise UsageError("OUTPUT is missing; only --view does without")
+    if options.output is not None and options.output.suffix.lower() != ".obj":
         raise UsageError(f"{options.output}: poses are written as .obj")
     if options.height is not None and not options.height > 0:
         raise UsageError("--height must be positive")
-    pose = _pose(options)
+    pose = None if options.view else _pose(options)
     try:
         cleaned = read_mesh_file(options.input).cleaned()
     except MeshFileError as error:
@@ -72,9 +82,41 @@ def run(options: argparse.Namespace) -> int:
     stance = Stance(options.y_up)
     if options.height is not None:
         stance = stance._replace(scale=options.height / stance.height(x))
-    posed = load_pretrained("repose").repose(dp.Mesh(stance.standing(x), faces), pose)[0]
+    network = load_pretrained("repose")
+    if pose is None:
+        return _view(network, dp.Mesh(x, faces), stance, options)
+    posed = network.repose(dp.Mesh(stance.standing(x), faces), pose)[0]
     _write(options.output, stance.back(posed), faces)
     print(f"{options.output}  {len(faces):,} triangles")
+    return 0
+
+
+def _view(
+    network: ReposeNetwork, mesh: dp.Mesh, stance: Stance, options: argparse.Namespace
+) -> int:
+    """Serve the page until interrupted."""
+    try:
+        from njf_models.repose_viewer import ReposeViewer  # noqa: PLC0415  (needs viser)
+    except ModuleNotFoundError as error:
+        raise CommandError(
+            f"{error.name} is not installed: pip install 'diffpoisson[view]'"
+        ) from error
+
+    def save(vertices: Tensor) -> None:
+        _write(options.output, vertices, mesh.faces)
+        print(f"{options.output}  {mesh.n_faces:,} triangles", flush=True)
+
+    with ReposeViewer(
+        network,
+        mesh,
+        stance,
+        title=options.input.name,
+        save=None if options.output is None else save,
+        host=options.host,
+        port=options.port,
+    ) as viewer:
+        print(f"{options.input.name} at {viewer.address} (Ctrl-C ends)", flush=True)
+        viewer.serve()
     return 0
 
 

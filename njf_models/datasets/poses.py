@@ -7,6 +7,8 @@ axis of that frame. Angles are in radians, but in degrees in the table of limits
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -36,6 +38,49 @@ _LIMBS = ("clavicle", "upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerl
 
 JOINTS: tuple[str, ...] = _TRUNK + tuple(f"{name}.{side}" for side in "LR" for name in _LIMBS)
 """The joints of a pose, by anny's names, in the order of its rows."""
+
+
+class Freedom(NamedTuple):
+    """One of the angles that poses are drawn by.
+
+    Attributes:
+        joint: whose, one of `JOINTS`.
+        name: of the angle.
+        axis: (3,) unit vector that it turns about.
+        low: its least value, in degrees.
+        high: its greatest.
+    """
+
+    joint: str
+    name: str
+    axis: Float[np.ndarray, "3"]
+    low: float
+    high: float
+
+
+def freedoms() -> list[Freedom]:
+    """The angles of all joints, by joint: elbow and knee bend, others turn about three axes.
+
+    The rotation vector of a joint is the sum of its angles times their axes. An axis about which a
+    joint doesn't turn is left out.
+    """
+    hinges = {
+        "lowerarm01": (_ELBOW_AXIS, ELBOW_LIMIT),
+        "lowerleg01": (np.array([1.0, 0.0, 0.0]), KNEE_LIMIT),
+    }
+    angles = []
+    for joint in JOINTS:
+        name, _, side = joint.partition(".")
+        flip = _MIRROR if side == "R" else np.ones(3)
+        if name in hinges:
+            axis, limit = hinges[name]
+            angles.append(Freedom(joint, "bend", flip * axis, 0.0, limit))
+            continue
+        for i, (low, high) in enumerate(LIMITS[name]):
+            if low < high:
+                ends = sorted((flip[i] * low, flip[i] * high))
+                angles.append(Freedom(joint, "xyz"[i], np.eye(3)[i], *ends))
+    return angles
 
 
 def sample_pose(rng: np.random.Generator, heading: float = 0.0) -> Float[np.ndarray, "joints=20 3"]:

@@ -92,7 +92,7 @@ def test_a_character_in_other_units_whose_y_is_up(network, tmp_path):
         (["out.obj", "--joint", "head", "1", "2", "x"], 2, "three numbers, in degrees"),
         (["out.obj", "--random", "1", "--height", "0"], 2, "--height must be positive"),
         (["out.obj", "--pose", "missing.json"], 1, "missing.json: No such file"),
-        (["out.obj"], 2, "one of the arguments --pose --joint --random is required"),
+        (["out.obj"], 2, "one of the arguments --pose --joint --random --view is required"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(case, character, capsys, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,23 +15,36 @@ from njf_models.baselines.displacement import DisplacementField
 from njf_models.body_maps import (
     BodyCells,
     BodyMaps,
+    PosedBodies,
+    Task,
     body_loader,
     cell_loader,
     evaluate_maps,
+    pair_loader,
+    paired_cells,
     summarise,
 )
+from njf_models.features import face_features
 from njf_models.losses import paper_loss, sampled_loss
 from njf_models.models import MODELS
 from njf_models.sampled import Cells
 from njf_models.training import (
     NJFTraining,
     Phase,
+    encoded_cells,
     fit_phases,
     last_checkpoint,
     load_checkpoint,
 )
 from tests.njf_models.shapes import ellipsoid, prepared, randomised
 from tests.njf_models.test_body_maps import INPUTS, MODEL, twisted
+
+TOLD_BY_POINTS = {
+    "face_features": 6,
+    "point_features": 6,
+    "code_size": 16,
+    "encodes_target": True,
+}
 
 
 def of_faces(mesh, target, chosen):
@@ -108,6 +122,61 @@ def test_several_sources_serve_their_own_targets():
     assert code.shape == (2, 4, 8 + 8 + 3)
     for i in range(2):
         assert_close(code[i], model.encode(sources[i], targets[i], parameters[i]))
+
+
+def test_bodies_of_a_step_are_each_others_targets():
+    """Every cell is found again, by its features, among the faces of the whole shape."""
+    maps = BodyMaps(
+        [twisted(number) for number in range(4)],
+        Task(sources=3, told="points", others=True),
+        resample=True,
+        **INPUTS,
+    )
+    posed = [PosedBodies(maps)[index] for index in (0, 4, 8, 11, 2)]
+    cells = paired_cells(posed, "faces", 7, 3)
+    assert cells.partners.shape == (5, 3)
+    for i, (source, points) in enumerate(posed):
+        others = cells.partners[i].tolist()
+        assert i not in others
+        assert len(set(others)) == 3
+        assert torch.equal(cells.points[i], points)
+        mesh = source.mesh
+        faces = torch.cdist(cells.features[i], face_features(mesh, None).float()).argmin(1)
+        for k, j in enumerate(others):
+            J = dp.jacobians(mesh, posed[j].source.mesh.vertices)[faces]
+            assert_close(cells.target[i, k].double(), J, rtol=1e-4, atol=1e-4)
+    assert paired_cells(posed, "faces", 2, 99).partners.shape == (5, 4)  # all others
+
+
+def test_a_body_encoded_once_has_the_codes_and_the_loss_of_one_encoded_for_each_map():
+    module = NJFTraining(TOLD_BY_POINTS)
+    randomised(module.model).float()
+    maps = BodyMaps(
+        [twisted(number) for number in range(4)], Task(sources=2, told="points"), **INPUTS
+    )
+    (cells,) = list(pair_loader(maps, "faces", 5, 8, 3))
+    apart = replace(cells, partners=None, target_points=cells.points[cells.partners])
+    loss, expected = module.training_step(cells, 0), module.training_step(apart, 0)
+    assert_close(loss, expected)
+    losses = (loss, expected)
+    for a, b in zip(
+        *(torch.autograd.grad(x, list(module.parameters())) for x in losses), strict=True
+    ):
+        assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_what_has_no_partners_raises():
+    pairs = torch.zeros(2, 1, dtype=torch.long)
+    with pytest.raises(ValueError, match="a model that encodes source and target"):
+        NeuralJacobianField(6, 6, parameters=2).encode_pairs(torch.randn(2, 4, 6), pairs)
+    cells = Cells(
+        torch.zeros(2, 2, 6), torch.zeros(2, 1, 2, 3), torch.zeros(2, 4, 6), partners=pairs
+    )
+    with pytest.raises(ValueError, match="DiffusionMap does not learn maps among shapes"):
+        encoded_cells(MODELS["diffusion"](6), cells)
+    partial = BodyMaps([twisted(0), twisted(1)], Task(sources=2, told="points", pieces=1), **INPUTS)
+    with pytest.raises(ValueError, match="no targets of others"):
+        PosedBodies(partial)
 
 
 def test_what_samples_cannot_train_raises():

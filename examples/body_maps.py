@@ -46,12 +46,12 @@ from njf_models.body_maps import (
     cell_loader,
     evaluate_maps,
     pair_loader,
-    summarise,
 )
 from njf_models.body_report import BodyRow, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
 from njf_models.evaluation import format_table
 from njf_models.experiments import circumstances, quiet, training_cost
+from njf_models.map_errors import summarise
 from njf_models.models import MODELS
 from njf_models.training import (
     NJFTraining,

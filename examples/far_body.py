@@ -27,11 +27,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 import diffpoisson as dp
-from njf_models.body_maps import BodyMaps, MapRecord, evaluate_maps, summarise
+from njf_models.body_maps import BodyMaps, MapRecord, evaluate_maps
 from njf_models.body_report import BodyRow, save_body_report
 from njf_models.datasets.bodies import PHENOTYPES, Body, BodyModel, BodyStore, retriangulated
 from njf_models.datasets.triangulation import Triangulation
 from njf_models.evaluation import format_table
+from njf_models.map_errors import summarise
 from njf_models.meshfiles import read_mesh_file
 from njf_models.repose_network import ReposeNetwork, Stance
 

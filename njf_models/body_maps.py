@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -17,9 +16,8 @@ import diffpoisson as dp
 from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.datasets.partial import Partial, cut_pieces
 from njf_models.features import Shape, point_features
-from njf_models.metrics import l2_jacobians, l2_normals, l2_vertices
+from njf_models.map_errors import MapErrors, map_errors
 from njf_models.models import Model
-from njf_models.njf import Prediction
 from njf_models.sampled import CellKind, Cells
 from njf_models.training import Batch, encoded
 
@@ -305,29 +303,21 @@ def pair_loader(
 # -------------------------------------------------------------------- evaluation
 
 
-@dataclass(frozen=True)
-class MapRecord:
-    """Errors of one map, by the paper's metrics.
+@dataclass(frozen=True, kw_only=True)
+class MapRecord(MapErrors):
+    """Errors of one map, and which it is.
 
     Attributes:
         body: number of the source's identity in its data set.
         source: number of the source's pose; None for the rest pose.
         target: number of the target's identity.
         pose: number of the target's pose.
-        l2_v: L2-V.
-        l2_j: L2-J of the Jacobians before the Poisson solve, as the paper has it.
-        l2_j_emitted: L2-J of those of the emitted map.
-        l2_n: L2-N, in degrees.
     """
 
     body: int
     source: int | None
     target: int
     pose: int
-    l2_v: float
-    l2_j: float
-    l2_j_emitted: float
-    l2_n: float
 
 
 @torch.no_grad()
@@ -348,42 +338,19 @@ def evaluate_maps(
         batch, source = maps[index], maps.source(index)
         prediction = model(batch.shape, encoded(model, batch))
         records += [
-            MapRecord(source.body.number, source.pose, maps.bodies[body].number, pose, *errors)
+            MapRecord(
+                **vars(errors),
+                body=source.body.number,
+                source=source.pose,
+                target=maps.bodies[body].number,
+                pose=pose,
+            )
             for (body, pose), errors in zip(
-                maps.targets(index).tolist(), _errors(batch, prediction), strict=True
+                maps.targets(index).tolist(),
+                map_errors(batch.shape.mesh, prediction, batch.target),
+                strict=True,
             )
         ]
         emitted.append(prediction.vertices)
     model.train(was_training)
     return records, emitted
-
-
-def summarise(records: Sequence[MapRecord]) -> dict[str, float]:
-    """Means over all maps, and the spread of L2-V."""
-
-    def column(name: str) -> np.ndarray:
-        return np.array([getattr(record, name) for record in records])
-
-    summary = {
-        "maps": len(records),
-        "L2-V": column("l2_v").mean(),
-        "L2-V, median": np.median(column("l2_v")),
-        "L2-V, 90%": np.percentile(column("l2_v"), 90),
-        "L2-J": column("l2_j").mean(),
-        "L2-J, emitted": column("l2_j_emitted").mean(),
-        "L2-N, degrees": column("l2_n").mean(),
-    }
-    return {name: float(value) for name, value in summary.items()}
-
-
-def _errors(batch: Batch, prediction: Prediction) -> list[list[float]]:
-    """The errors of a record, for each map."""
-    mesh, phi, target = batch.shape.mesh, prediction.vertices.double(), batch.target.double()
-    J = dp.jacobians(mesh, target)
-    columns = (
-        l2_vertices(phi, target),
-        l2_jacobians(prediction.jacobians.double(), J),
-        l2_jacobians(dp.jacobians(mesh, phi), J),
-        l2_normals(phi, target, mesh.faces),
-    )
-    return torch.stack(columns, dim=-1).tolist()

@@ -14,12 +14,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
+from njf_models import map_errors as errors_of_maps
 from njf_models.datasets.arap import ArapMaps
 from njf_models.datasets.contact import ContactMaps
 from njf_models.features import Shape
-from njf_models.metrics import l2_jacobians, l2_normals, l2_vertices
+from njf_models.map_errors import MapErrors, map_errors
 from njf_models.models import Model
-from njf_models.njf import Prediction
 from njf_models.training import Batch
 
 
@@ -118,23 +118,15 @@ def elastic_loader(batches: ElasticBatches) -> DataLoader[Batch]:
 # -------------------------------------------------------------------- evaluation
 
 
-@dataclass(frozen=True)
-class ElasticRecord:
-    """Errors of one map, by the paper's metrics.
+@dataclass(frozen=True, kw_only=True)
+class ElasticRecord(MapErrors):
+    """Errors of one map, and its time.
 
     Attributes:
-        l2_v: L2-V.
-        l2_j: L2-J of the Jacobians before the Poisson solve, as the paper has it.
-        l2_j_emitted: L2-J of those of the emitted map.
-        l2_n: L2-N, in degrees.
         milliseconds: of CPU time for code, network and solve of this map alone, features and factor
             given.
     """
 
-    l2_v: float
-    l2_j: float
-    l2_j_emitted: float
-    l2_n: float
     milliseconds: float
 
 
@@ -162,39 +154,16 @@ def evaluate_elastic(
             phi = solver(prediction.jacobians, pins=maps.held_positions(index))
             prediction = prediction._replace(vertices=phi)
         milliseconds = 1000 * (time.process_time() - start)
-        errors = _errors(shape, prediction, maps.positions[index])
-        records.append(ElasticRecord(**errors, milliseconds=milliseconds))
+        (errors,) = map_errors(shape.mesh, prediction, maps.positions[index : index + 1])
+        records.append(ElasticRecord(**vars(errors), milliseconds=milliseconds))
         images.append(prediction.vertices[0])
     model.train(was_training)
     return records, torch.stack(images)
 
 
-def _errors(shape: Shape, prediction: Prediction, target: Float[Tensor, "n 3"]) -> dict[str, float]:
-    mesh, phi, target = shape.mesh, prediction.vertices[0].double(), target.double()
-    J = dp.jacobians(mesh, target)
-    errors = {
-        "l2_v": l2_vertices(phi, target),
-        "l2_j": l2_jacobians(prediction.jacobians[0].double(), J),
-        "l2_j_emitted": l2_jacobians(dp.jacobians(mesh, phi), J),
-        "l2_n": l2_normals(phi, target, mesh.faces),
-    }
-    return {name: float(error) for name, error in errors.items()}
-
-
 def summarise(records: Sequence[ElasticRecord]) -> dict[str, float]:
     """Means over all maps, the spread of L2-V, and the median time."""
-
-    def column(name: str) -> np.ndarray:
-        return np.array([getattr(record, name) for record in records])
-
-    summary = {
-        "maps": len(records),
-        "L2-V": column("l2_v").mean(),
-        "L2-V, median": np.median(column("l2_v")),
-        "L2-V, 90%": np.percentile(column("l2_v"), 90),
-        "L2-J": column("l2_j").mean(),
-        "L2-J, emitted": column("l2_j_emitted").mean(),
-        "L2-N, degrees": column("l2_n").mean(),
-        "CPU milliseconds, median": np.median(column("milliseconds")),
+    milliseconds = [record.milliseconds for record in records]
+    return errors_of_maps.summarise(records) | {
+        "CPU milliseconds, median": float(np.median(milliseconds)),
     }
-    return {name: float(value) for name, value in summary.items()}

@@ -11,10 +11,11 @@ from torch.testing import assert_close
 
 import diffpoisson as dp
 from njf_models import NeuralJacobianField
-from njf_models.body_maps import BodyMaps, Task, body_loader, evaluate_maps, summarise
+from njf_models.body_maps import BodyMaps, Task, body_loader, evaluate_maps
 from njf_models.body_report import BodyRow, render_body, save_body_report
 from njf_models.datasets.bodies import POSE_SIZE, Body
 from njf_models.losses import paper_loss
+from njf_models.map_errors import summarise
 from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
 from tests import meshes
 

@@ -22,10 +22,10 @@ from njf_models.body_maps import (
     evaluate_maps,
     pair_loader,
     paired_cells,
-    summarise,
 )
 from njf_models.features import face_features
 from njf_models.losses import paper_loss, sampled_loss
+from njf_models.map_errors import summarise
 from njf_models.models import MODELS
 from njf_models.sampled import Cells
 from njf_models.training import (

@@ -11,7 +11,6 @@ import argparse
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -25,27 +24,20 @@ KINDS = {
 WEIGHTS = Path(__file__).parents[2] / "njf_models" / "weights"
 
 
-def steps(checkpoint: dict[str, Any] | None) -> int:
-    return 0 if checkpoint is None else int(checkpoint["global_step"])
-
-
-def seconds(checkpoint: dict[str, Any] | None) -> float:
-    """Of processor time."""
-    return 0.0 if checkpoint is None else float(checkpoint["cpu_seconds"])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("store", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("commands", nargs="+")
-    parser.add_argument("--begun-with", type=Path, help="checkpoint that training began with")
+    parser.add_argument(
+        "--begun-with", type=Path, nargs="*", default=[], help="checkpoints of trainings before"
+    )
     parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--max-energy", type=float, default=8.0, help="as training had it")
     options = parser.parse_args()
     checkpoint = options.out / "checkpoints" / "best.ckpt"
     record = torch.load(checkpoint, map_location="cpu", weights_only=False)
-    before = options.begun_with and torch.load(options.begun_with, weights_only=False)
+    trainings = [torch.load(p, weights_only=False) for p in options.begun_with] + [record]
     WEIGHTS.mkdir(exist_ok=True)
     network = UVNetwork.from_checkpoint(checkpoint)
     network.save(WEIGHTS / "uv.safetensors")
@@ -65,8 +57,10 @@ def main() -> None:
         "licences of the meshes": ", ".join(f"{n} {name}" for name, n in licences.most_common()),
         "split by mesh family": ", ".join(f"{n} {name}" for name, n in counts.items()),
         "chosen by": "loss on the validation split",
-        "optimiser steps": steps(record) + steps(before),
-        "minutes of processor time": round((seconds(record) + seconds(before)) / 60, 1),
+        "optimiser steps": sum(int(training["global_step"]) for training in trainings),
+        "minutes of processor time": round(
+            sum(float(training["cpu_seconds"]) for training in trainings) / 60, 1
+        ),
         "machine": options.machine,
         "commands": " ; ".join(options.commands),
         "limits": "trained on disk patches of 500 to 2,000 faces; closed surfaces cut open have no "

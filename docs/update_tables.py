@@ -10,8 +10,9 @@ import json
 import re
 import sys
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
@@ -329,24 +330,34 @@ def uv_diffusion() -> str:
 
 
 def uv_certified() -> str:
-    """Patches that no network saw, from `tests/benchmarks/uv_certified.py`."""
-    result = json.loads((RESULTS / "uv_certified.json").read_text())
-    methods = ", ".join(f"{name} {count:,}" for name, count in result["methods"].items())
-    rows = {
-        "patches of 500 to 2,000 faces": f"{result['patches']:,} of {result['meshes']:,} meshes",
-        "with a flip": f"{result['patches with a flip']}",
-        "not certified to be one-to-one": f"{result['not certified']}",
-        "symmetric Dirichlet, median, 99%, worst": ", ".join(
-            number(result[f"energy, {name}"]) for name in ("median", "99%", "worst")
+    """Patches that no network saw, from `tests/benchmarks/uv_certified.py`, by either weights."""
+    names = {"`uv`": "uv_certified", "`uv-pointnet`": "uv_certified_pointnet"}
+    results = [json.loads((RESULTS / f"{name}.json").read_text()) for name in names.values()]
+
+    def several(result: dict[str, Any], what: str, *keys: str) -> str:
+        return ", ".join(number(result[f"{what}, {key}"]) for key in keys)
+
+    def methods(result: dict[str, Any]) -> str:
+        return ", ".join(f"{name} {count:,}" for name, count in result["methods"].items())
+
+    rows: dict[str, Callable[[dict[str, Any]], str]] = {
+        "patches of 500 to 2,000 faces": lambda r: f"{r['patches']:,} of {r['meshes']:,} meshes",
+        "with a flip": lambda r: f"{r['patches with a flip']}",
+        "not certified to be one-to-one": lambda r: f"{r['not certified']}",
+        "symmetric Dirichlet, median, 99%, worst": lambda r: several(
+            r, "energy", "median", "99%", "worst"
         ),
-        "processor seconds each, median, worst": ", ".join(
-            number(result[f"processor seconds, {name}"]) for name in ("median", "worst")
+        "processor seconds each, median, worst": lambda r: several(
+            r, "processor seconds", "median", "worst"
         ),
         "came through": methods,
     }
-    return "\n".join(
-        ["| | |", "|---|---|", *(f"| {name} | {cell} |" for name, cell in rows.items())]
-    )
+    lines = [f"| | {' | '.join(names)} |", "|---|---|---|"]
+    lines += [
+        f"| {title} | {' | '.join(row(result) for result in results)} |"
+        for title, row in rows.items()
+    ]
+    return "\n".join(lines)
 
 
 def uv_card() -> str:

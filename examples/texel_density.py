@@ -39,7 +39,7 @@ def main(argv: list[str] | None = None) -> dict[str, list[float]]:
     options = parser.parse_args(argv)
     options.out.mkdir(parents=True, exist_ok=True)
 
-    network = load_pretrained("uv")
+    network = load_pretrained("uv-pointnet")  # which has a code to descend on
     disk = network.prepare(wavy_dome(options.size))
     model, shape = network.model.requires_grad_(False), disk.shape
     top = highest(shape.mesh, share=0.25)

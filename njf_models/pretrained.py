@@ -32,7 +32,8 @@ def load_pretrained(name: str = "uv") -> UVNetwork | ReposeNetwork:
     """A trained network that comes with this package; `card` says what it was trained on.
 
     Args:
-        name: "uv", for maps of surfaces to the plane, or "repose", for bodies in other poses.
+        name: "uv", for maps of surfaces to the plane; "uv-pointnet", the same without eigenpairs;
+            or "repose", for bodies in other poses.
 
     Raises:
         ValueError: there are no weights of that name.

@@ -30,24 +30,24 @@ def uv_train() -> str:
         for name in ("uv_train", "uv_train_paper")
     )
     assert ours["splits"] == theirs["splits"]
-    before, after = ours["summary"]["untrained"], ours["summary"]["trained"]
-    papers = theirs["summary"]["trained"]
+    steps, after = ours["summary"]["untrained"], ours["summary"]["trained"]
+    before, papers = theirs["summary"]["untrained"], theirs["summary"]["trained"]
     paper = {  # Table 1 of the paper: Thingi10K patches / other meshes
         "patches with a flip, raw, %": "19 / 10",
         "flips per patch, raw": "3.44 / 0.77",
         "D>10 per patch, raw": "5.67 / 1.99",
     }
     rows = [
-        f"| {name} | {number(before[name])} | {number(papers[name])} | {number(after[name])} "
-        f"| {paper.get(name, '–')} |"
+        f"| {name} | {number(before[name])} | {number(papers[name])} | {number(steps[name])} "
+        f"| {number(after[name])} | {paper.get(name, '–')} |"
         for name in after
         if name not in ("patches", "milliseconds per patch, median")  # times depend on the load
     ]
     return "\n".join(
         [
-            f"| {after['patches']:.0f} patches of unseen meshes | untrained: projection "
-            "| the paper's network | ours | paper, other data |",
-            "|---|---|---|---|---|",
+            f"| {after['patches']:.0f} patches of unseen meshes | projection "
+            "| the paper's network | local/global steps | ours | paper, other data |",
+            "|---|---|---|---|---|---|",
             *rows,
         ]
     )

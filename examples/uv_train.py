@@ -58,8 +58,9 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     print(f"{len(train)} training, {len(validation)} validation, {len(test)} test patches")
 
     test_examples = examples(test, options)
-    identity = make_module(options, steps=1).model  # the projection to the plane
-    before, _ = evaluate_uv(identity, test_examples)
+    # The projection to the plane, or with our network four local/global steps from there.
+    untrained = make_module(options, steps=1).model
+    before, _ = evaluate_uv(untrained, test_examples)
     checkpoint = fit(train, validation, options)
     network = UVNetwork.from_checkpoint(checkpoint)
     network.save(options.out / "uv.safetensors")

@@ -377,15 +377,25 @@ def repose_card() -> str:
 def notices() -> str:
     """Where the meshes come from that the shipped weights were trained on."""
     weights = DOCS.parent / "njf_models" / "weights"
-    meshes = json.loads((weights / "uv.json").read_text())["meshes"]
-    sources = Counter(
-        (source.split(":")[0].split("(seed")[0], terms) for _, terms, source in meshes
-    )
-    rows = [
-        f"| {source} | {terms} | {count} |"
-        for (source, terms), count in sorted(sources.items(), key=lambda row: (-row[1], row[0]))
+    names = ("uv", "uv-pointnet")
+    counts = [
+        Counter(
+            (source.split(":")[0].split("(seed")[0].strip(), terms)
+            for _, terms, source in json.loads((weights / f"{name}.json").read_text())["meshes"]
+        )
+        for name in names
     ]
-    return "\n".join(["| source | licence | meshes, with bent copies |", "|---|---|---|", *rows])
+    sources = sorted(set.union(*map(set, counts)), key=lambda row: (-counts[0][row], row))
+    return "\n".join(
+        [
+            f"| source | licence | {' | '.join(f'meshes of `{name}`' for name in names)} |",
+            "|---|---|---|---|",
+            *(
+                f"| {' | '.join(row)} | {' | '.join(str(count[row]) for count in counts)} |"
+                for row in sources
+            ),
+        ]
+    )
 
 
 def repose() -> str:

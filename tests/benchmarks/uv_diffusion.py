@@ -56,7 +56,9 @@ CONTESTANTS = {
     "4 rounds, 64 wide, DiffusionNet of 64 channels": diffusing(64, 64),
     "4 rounds, 32 wide, DiffusionNet of 64 channels": diffusing(64, 32),
     "4 rounds, 32 wide, DiffusionNet of 32 channels": diffusing(32, 32),
-    "the same with 32 eigenpairs instead of 64": diffusing(32, 32, eigenpairs=32),
+    "4 rounds, 32 wide, DiffusionNet of 32 channels, 32 eigenpairs": diffusing(
+        32, 32, eigenpairs=32
+    ),
 }
 
 

@@ -32,7 +32,6 @@ from njf_models.training import (
     make_trainer,
 )
 from tests import meshes
-from tests.benchmarks.uv_card import minutes_of_training
 
 MODEL = {"face_features": 6, "point_features": 6, "code_size": 16, "output_dim": 2}
 
@@ -331,10 +330,3 @@ def test_shape_weights_are_shares_of_each_part(patches):
     ):
         for part in split(weights):
             assert_close(float(part.sum()), 1.0)
-
-
-def test_minutes_on_a_card_are_those_recorded():
-    assert minutes_of_training({"training_seconds": 90.0}, 7.0) == 1.5
-    assert minutes_of_training({"training_seconds": None}, 7.0) == 7.0
-    with pytest.raises(SystemExit, match="pass --minutes"):
-        minutes_of_training({}, None)

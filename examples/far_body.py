@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,8 @@ def built_in(
     rows, table = [], {}
     for name, parameters in phenotypes.items():
         body = retriangulated(model, original, replace(near, phenotype=parameters))
-        maps = BodyMaps([body], **asdict(network.inputs))
+        seen = network.inputs
+        maps = BodyMaps([body], n_points=seen.n_points, n_energies=seen.n_energies)
         records, emitted = evaluate_maps(network.model, maps)
         table[name] = summarise(records)
         at = median(records)

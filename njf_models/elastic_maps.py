@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from njf_models import map_errors as errors_of_maps
 from njf_models.datasets.arap import ArapMaps
 from njf_models.datasets.contact import ContactMaps
 from njf_models.features import Shape
 from njf_models.map_errors import MapErrors, map_errors
+from njf_models.map_errors import summarise as summarise_errors
 from njf_models.models import Model
 from njf_models.training import Batch
 
@@ -164,6 +164,6 @@ def evaluate_elastic(
 def summarise(records: Sequence[ElasticRecord]) -> dict[str, float]:
     """Means over all maps, the spread of L2-V, and the median time."""
     milliseconds = [record.milliseconds for record in records]
-    return errors_of_maps.summarise(records) | {
+    return summarise_errors(records) | {
         "CPU milliseconds, median": float(np.median(milliseconds)),
     }

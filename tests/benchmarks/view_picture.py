@@ -6,22 +6,19 @@ examples, view and browser, and a Chromium on the path.
 
 from __future__ import annotations
 
-import shutil
-import threading
 from pathlib import Path
 
 import numpy as np
 import torch
-from playwright.sync_api import sync_playwright
 from scipy.spatial.transform import Rotation
 
 import diffpoisson as dp
 from njf_models.datasets.sources import DogBones
 from njf_models.viewer import Viewer
-from tests.benchmarks.page_picture import BONE, FLAGS
+from tests.benchmarks.page_picture import BONE
+from tests.benchmarks.window_picture import photographed
 
 PICTURE = Path(__file__).parents[2] / "docs" / "images" / "view.png"
-SECONDS = 20  # software rendering is slow
 
 
 def ends(vertices: torch.Tensor) -> list[int]:
@@ -34,27 +31,14 @@ def ends(vertices: torch.Tensor) -> list[int]:
 def main() -> None:
     bone = next(bone for bone in DogBones(n_faces=1) if bone.name == BONE)
     mesh = dp.Mesh.cleaned(bone.vertices, bone.faces, merge_duplicates=True).mesh
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    with Viewer(mesh, "pelvis.ply") as window, sync_playwright() as playwright:
-        thread = threading.Thread(target=window.serve)
-        thread.start()
-        browser = playwright.chromium.launch(executable_path=chromium, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": 1200, "height": 700})
-        page.goto(window.address)
-        page.wait_for_timeout(1000 * SECONDS)
+    window = Viewer(mesh, "pelvis.ply")
+    with photographed(window, PICTURE, height=700):
         names = [window.add_handle(vertex) for vertex in ends(mesh.vertices)]
         size = window.pose.diagonal
         for name, up, angle in zip(names, (0.25, 0.0, 0.25), (-0.6, 0.0, 0.6), strict=True):
             x, y, z, w = Rotation.from_rotvec([0, 0, angle]).as_quat()
             place = window.pose.handles[name].centre.numpy() + np.array([0, up * size, 0])
             window.move_handle(name, place, np.array([w, x, y, z]))
-        page.wait_for_timeout(1000 * SECONDS)
-        page.mouse.click(288, 80)  # away with the warning of software rendering
-        page.wait_for_timeout(2000)
-        page.screenshot(path=PICTURE)
-        browser.close()
-        window.close()
-        thread.join()
 
 
 if __name__ == "__main__":

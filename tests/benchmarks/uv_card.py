@@ -21,6 +21,11 @@ KINDS = {
     "njf": "Neural Jacobian Field",
     "diffusion+njf": "Neural Jacobian Field with DiffusionNet as encoder",
 }
+CHOSEN_BY = {
+    "best": "loss on the validation split",
+    "last": "flips and energy of the emitted maps on the validation split, where the end of "
+    "training was ahead of the step of least loss",
+}
 WEIGHTS = Path(__file__).parents[2] / "njf_models" / "weights"
 
 
@@ -34,8 +39,9 @@ def main() -> None:
     )
     parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--max-energy", type=float, default=8.0, help="as training had it")
+    parser.add_argument("--checkpoint", choices=CHOSEN_BY, default="best")
     options = parser.parse_args()
-    checkpoint = options.out / "checkpoints" / "best.ckpt"
+    checkpoint = options.out / "checkpoints" / f"{options.checkpoint}.ckpt"
     record = torch.load(checkpoint, map_location="cpu", weights_only=False)
     trainings = [torch.load(p, weights_only=False) for p in options.begun_with] + [record]
     WEIGHTS.mkdir(exist_ok=True)
@@ -56,7 +62,7 @@ def main() -> None:
         f"faces on average, targets by SLIM with energies up to {options.max_energy}",
         "licences of the meshes": ", ".join(f"{n} {name}" for name, n in licences.most_common()),
         "split by mesh family": ", ".join(f"{n} {name}" for name, n in counts.items()),
-        "chosen by": "loss on the validation split",
+        "chosen by": CHOSEN_BY[options.checkpoint],
         "optimiser steps": sum(int(training["global_step"]) for training in trainings),
         "minutes of processor time": round(
             sum(float(training["cpu_seconds"]) for training in trainings) / 60, 1

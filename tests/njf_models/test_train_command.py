@@ -67,6 +67,24 @@ def test_data_and_training_by_their_commands(tmp_path, capsys):
     assert (network.kind, network.inputs.n_eigenpairs) == ("diffusion+njf", 12)
     assert moves(network)
 
+    # Begun with these weights, one step goes hardly anywhere; other networks are refused.
+    train[2], begun = str(tmp_path / "begun"), last_checkpoint(tmp_path / "diffusing")
+    small = [*train, *net, "--rounds", "2", "--steps", "1", "--rate", "1e-9"]
+    network.save(tmp_path / "begun.safetensors")
+    for weights in (begun, tmp_path / "begun.safetensors"):
+        assert main([*small, "--init", str(weights)]) == 0
+        after = UVNetwork.from_checkpoint(last_checkpoint(tmp_path / "begun"))
+        for name, value in network.model.state_dict().items():
+            torch.testing.assert_close(after.model.state_dict()[name], value, atol=1e-7, rtol=0)
+        train[2] = small[2] = str(tmp_path / "again")
+    capsys.readouterr()
+    small[small.index("--eigenpairs") + 1] = "13"
+    small[2] = str(tmp_path / "refused")
+    for weights, difference in ((str(begun), "eigenpairs 12, not 13"), ("uv", "net_width 32, not")):
+        assert main([*small, "--init", weights]) == 2
+        assert f"--init {weights} is of a network with" in (said := capsys.readouterr().err)
+        assert difference in said
+
 
 def test_data_from_a_cluster_by_its_address(tmp_path, capsys):
     distributed = pytest.importorskip("distributed")

@@ -17,7 +17,7 @@ import trimesh
 
 import diffpoisson as dp
 from njf_models.cli import main
-from njf_models.commands import uv
+from njf_models.commands import info, uv
 from njf_models.meshfiles import read_mesh_file
 from tests import meshes
 
@@ -165,6 +165,27 @@ def test_a_fault_of_ours_is_one_line_too(tmp_path, monkeypatch, capsys):
 
 
 # ------------------------------------------------------- one file
+
+
+def test_a_missing_extra_is_named(disk, monkeypatch, capsys):
+    def broken(*_: object) -> None:
+        raise ModuleNotFoundError("No module named 'trimesh'", name="trimesh")
+
+    monkeypatch.setattr(info, "mesh_facts", broken)
+    assert main(["info", str(disk)]) == 1
+    remedy = "njf info: trimesh is not installed: pip install 'diffpoisson[uv]'\n"
+    assert capsys.readouterr().err == remedy
+
+
+def test_a_reader_who_leaves_is_no_error(disk):
+    """As `njf info FILE | head -0` does."""
+    command = [sys.executable, "-m", "njf_models.cli", "info", str(disk)]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(timeout=120)) == ("", 1)
+    process.stderr.close()
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])

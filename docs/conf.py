@@ -32,6 +32,12 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 
+# `sphinx-build -b linkcheck docs build/links`, by hand before a release: it asks the network.
+linkcheck_ignore = [r"http://(127\.0\.0\.1|localhost)(:\d+)?"]  # the windows of `njf view`
+linkcheck_allowed_redirects = {r"https://doi\.org/.*": r".*"}  # what a DOI is for
+linkcheck_timeout = 30
+linkcheck_retries = 2
+
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 

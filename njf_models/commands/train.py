@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from njf_models.datasets.store import UVStore
-    from njf_models.trained import Inputs, TrainedNetwork
+    from njf_models.trained import Inputs
 
 _EXAMPLE = """\
 examples:
@@ -138,18 +138,11 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _begin_with(
-    model: nn.Module, arguments: dict[str, Any], inputs: Inputs, weights: str
-) -> None:
+def _begin_with(model: nn.Module, arguments: dict[str, Any], inputs: Inputs, weights: str) -> None:
     """Load weights that are known by name or in a file, of a network made and fed like this one."""
-    from njf_models.pretrained import load_pretrained  # noqa: PLC0415
-    from njf_models.uv_network import UVNetwork  # noqa: PLC0415
+    from njf_models.pretrained import load_uv_network  # noqa: PLC0415
 
-    path = Path(weights)
-    if path.suffix == ".ckpt":
-        network: TrainedNetwork = UVNetwork.from_checkpoint(path)
-    else:
-        network = UVNetwork.load(path) if path.suffix else load_pretrained(weights)
+    network = load_uv_network(weights)
     # PointNet takes any number of points; a network that diffuses has learned of its eigenpairs.
     theirs = network.arguments | {"eigenpairs": network.inputs.n_eigenpairs}
     ours = arguments | {"eigenpairs": inputs.n_eigenpairs}

@@ -331,7 +331,9 @@ def test_the_network_is_the_default(disk, monkeypatch, capsys):
     monkeypatch.setattr(njf_models, "parameterize", parameterize, raising=False)
     assert main(["uv", str(disk)]) == 0
     assert main(["uv", str(disk), "--no-cut", "--tolerance", "1e-3"]) == 0
-    assert calls == [{"cut": True, "tolerance": 1e-6}, {"cut": False, "tolerance": 1e-3}]
+    uv = {"model": "uv"}
+    expected = [{"cut": True, "tolerance": 1e-6}, {"cut": False, "tolerance": 1e-3}]
+    assert calls == [uv | options for options in expected]
 
 
 # ------------------------------------------------------- folders

@@ -780,7 +780,7 @@ def gallery() -> str:
         costs = [training] if "cpu seconds" in training else list(training.values())
         spent = sum(sum(v for k, v in cost.items() if "cpu seconds" in k) for cost in costs)
         rows.append(f"| `examples/{name}.py` | – | {minutes(spent)} |")
-    head = ("| example | all of it | training alone |", "|---|---|---|")
+    head = ("| example | all of it | training of the run shown |", "|---|---|---|")
     return "\n".join([*head, *rows])
 
 

@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from njf_models.commands import CommandError, UsageError
+from njf_models.commands import CommandError, UsageError, how_to_install
 
 _DESCRIPTION = """\
 Give a mesh UVs: cut into charts where it is no disk, flattened with little distortion, no triangle
@@ -259,6 +259,8 @@ def convert(task: Task) -> dict[str, Any]:
         record |= _convert(task) | {"status": "ok"}
     except (MeshFileError, MeshError, CommandError) as error:
         record["error"] = str(error)
+    except ModuleNotFoundError as error:
+        record["error"] = how_to_install(error)
     except Exception as error:  # one bad file must not end a batch
         if task.debug:
             raise

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import trimesh
 
 import diffpoisson as dp
 from njf_models.cli import main
-from njf_models.commands import info, uv
+from njf_models.commands import how_to_install, info, uv
 from njf_models.meshfiles import read_mesh_file
 from tests import meshes
 
@@ -172,9 +173,22 @@ def test_a_missing_extra_is_named(disk, monkeypatch, capsys):
         raise ModuleNotFoundError("No module named 'trimesh'", name="trimesh")
 
     monkeypatch.setattr(info, "mesh_facts", broken)
-    assert main(["info", str(disk)]) == 1
-    remedy = "njf info: trimesh is not installed: pip install 'diffpoisson[uv]'\n"
-    assert capsys.readouterr().err == remedy
+    monkeypatch.setattr(uv, "_convert", broken)
+    remedy = "trimesh is not installed: pip install 'diffpoisson[uv]'\n"
+    assert main(["info", str(disk)]) == main(["uv", str(disk)]) == 1
+    assert capsys.readouterr().err == f"njf info: {remedy}njf uv: {disk}: {remedy}"
+
+
+@pytest.mark.parametrize("extra", ["uv", "view", "train"])
+def test_extras_are_as_the_package_declares_them(extra):
+    """Each of its packages is looked for in it; one of nobody's is asked for by its name."""
+    text = (ROOT / "pyproject.toml").read_text()
+    declared = tomllib.loads(text)["project"]["optional-dependencies"][extra]
+    names = {re.split(r"[^\w-]", line)[0].replace("pillow", "PIL") for line in declared}
+    for name in names - {"diffpoisson"}:
+        remedy = how_to_install(ModuleNotFoundError(name=f"{name}.part"))
+        assert remedy == f"{name} is not installed: pip install 'diffpoisson[{extra}]'"
+    assert how_to_install(ModuleNotFoundError(name="ray")).endswith(": pip install ray")
 
 
 def test_a_reader_who_leaves_is_no_error(disk):

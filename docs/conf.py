@@ -103,7 +103,8 @@ def visit_inline_math(translator: Any, node: nodes.math) -> None:
 
 def visit_block_math(translator: Any, node: nodes.math_block) -> None:
     """A formula on a line of its own."""
-    translator.body.append(convert(node.astext(), display="block"))
+    formula = convert(node.astext(), display="block")
+    translator.body.append(f'<div class="formula">{formula}</div>')
     raise nodes.SkipNode
 
 

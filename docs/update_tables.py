@@ -63,7 +63,11 @@ def transforms() -> str:
         if "missing" not in kinds
         for what, cells in kinds.items()
     }
-    lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
+    # Where a long name may break.
+    titles = [
+        name.replace("torchsparsegradutils", "torch&shy;sparse&shy;gradutils") for name in columns
+    ]
+    lines = ["| | " + " | ".join(titles) + " |", "|---|" + "---|" * len(columns)]
     for name in results["transforms"]:
         row = [transforms_cell(cells[name]) for cells in columns.values()]
         lines.append(f"| {name} | " + " | ".join(row) + " |")

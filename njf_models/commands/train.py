@@ -79,6 +79,7 @@ def run(options: argparse.Namespace) -> int:
     """Train until the steps or minutes are over."""
     import lightning  # noqa: PLC0415  (seconds to import)
 
+    from njf_models.experiments import quiet  # noqa: PLC0415
     from njf_models.trained import Inputs  # noqa: PLC0415
     from njf_models.training import (  # noqa: PLC0415
         NJFTraining,
@@ -88,6 +89,8 @@ def run(options: argparse.Namespace) -> int:
         make_trainer,
     )
 
+    if not options.debug:
+        quiet()
     options.out.mkdir(parents=True, exist_ok=True)
     lightning.seed_everything(options.seed, verbose=False)
     parts = _split(options)
@@ -135,6 +138,7 @@ def run(options: argparse.Namespace) -> int:
         loader(UVExamples(validation, **seen), 16),
         ckpt_path=last_checkpoint(options.out),
     )
+    print(f"best weights, for `njf uv --model`: {options.out / 'checkpoints' / 'best.ckpt'}")
     return 0
 
 

@@ -76,6 +76,14 @@ def test_files_that_are_named_exist(page):
         assert (ROOT / f"{module.replace('.', '/')}.py").is_file(), module
 
 
+def test_every_picture_of_a_thing_has_its_notice():
+    """Apart from plots and drawings, which show nothing of anybody's."""
+    notices = (ROOT / "docs" / "notices.md").read_text()
+    pictures = {path.name for path in (ROOT / "docs" / "images").iterdir()}
+    drawn = {name for name in pictures if name.startswith(("architecture.", "performance_"))}
+    assert {name for name in pictures if f"(images/{name})" in notices} == pictures - drawn
+
+
 def test_addresses_are_well_formed():
     """Encrypted, and DOIs by their resolver. Whether they answer, `-b linkcheck` asks."""
     files = [*PAGES, ROOT / "CITATION.cff", ROOT / "pyproject.toml"]

@@ -121,8 +121,9 @@ class GradientOperator:
     @constant_property
     def divergence_matrix(self) -> sp.csr_matrix:
         """∇ᵀA as a SciPy matrix (n, d·m)."""
-        weights = self.weights[:, 0].cpu().numpy()
-        return (sp.diags(weights) @ self.matrix).T.tocsr()
+        weighted = self.matrix.copy()
+        weighted.data *= np.repeat(self.weights[:, 0].cpu().numpy(), np.diff(weighted.indptr))
+        return weighted.T.tocsr()
 
     @constant_property
     def laplacian(self) -> sp.csr_matrix:

@@ -499,7 +499,9 @@ def _assemble(mesh: Mesh, constraints: Constraints) -> tuple[sp.csr_matrix, sp.c
     weights = constraints.face_weights.cpu().numpy()
     if (weights != 1).any():
         divergence = (divergence @ sp.diags(np.tile(weights, mesh.cell_dim))).tocsr()
-    L = divergence @ operator.matrix
-    strengths = np.zeros(mesh.n_vertices)
-    strengths[constraints.handles.cpu().numpy()] = constraints.handle_weights.cpu().numpy()
-    return divergence, (L + sp.diags(strengths)).tocsr()
+    L = (divergence @ operator.matrix).tocsr()
+    if len(constraints.handles):
+        strengths = np.zeros(mesh.n_vertices)
+        strengths[constraints.handles.cpu().numpy()] = constraints.handle_weights.cpu().numpy()
+        L = (L + sp.diags(strengths)).tocsr()
+    return divergence, L

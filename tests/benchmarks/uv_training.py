@@ -1,12 +1,13 @@
 """UV training in packed batches, against one patch a step through `nn.GroupNorm`.
 
-Networks, losses and batches are those of `njf train` by default; patches are of generated parts.
+Losses are those of `njf train` by default; patches are of generated parts.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,8 +25,10 @@ from tests.benchmarks.figures import Figure, Spread, Target, speed_up
 from tests.benchmarks.harness import alternate, main
 
 ARGUMENTS = {"face_features": 6, "point_features": 6, "code_size": 256, "output_dim": 2}
+NARROW = {"rounds": 4, "width": 32, "local_step": True}  # as the shipped weights
+NETWORKS = {"`njf train`'s default": {"rounds": 2}, "4 rounds, 32 wide": NARROW}
 OBJECTIVE = Objective(distortion=0.3, augment=True)
-PACKED = 8
+PACKED = (8, 16)
 BUDGET = 60.0  # processor seconds of training, where losses are compared
 
 
@@ -52,11 +55,16 @@ class Training:
     """A network in training: one step after the other, through the examples in turn."""
 
     def __init__(
-        self, examples: UVExamples, *, packed: int, kind: type[FieldMLP] = FieldMLP
+        self,
+        examples: UVExamples,
+        network: Mapping[str, Any],
+        *,
+        packed: int = 1,
+        kind: type[FieldMLP] = FieldMLP,
     ) -> None:
         torch.manual_seed(0)
         self.examples, self.packed = examples, packed
-        self.model = NeuralJacobianField(**ARGUMENTS, rounds=2)
+        self.model = NeuralJacobianField(**ARGUMENTS, **network)
         for mlp in (self.model.field, *self.model.corrections):
             mlp.__class__ = kind
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-3)
@@ -85,25 +93,33 @@ class Training:
 def throughput(quick: bool) -> Iterator[Figure]:
     """Patches per second of a whole step: points, packing, network, solves, loss, Adam."""
     train, _ = examples(quick)
-    packed, half, single = _trainings(train)
-
-    def one_by_one() -> None:
-        for _ in range(PACKED):
-            single.step()
-
     for _ in train:  # every example is prepared once, and kept
         pass
+    for name, network in NETWORKS.items():
+        for packed in PACKED:
+            yield from _throughput(train, name, network, packed, turns=2 if quick else 9)
+
+
+def _throughput(
+    train: UVExamples, name: str, network: Mapping[str, Any], packed: int, turns: int
+) -> Iterator[Figure]:
+    single = Training(train, network, kind=PlainMLP)
+
+    def one_by_one() -> None:
+        for _ in range(packed):
+            single.step()
+
     contestants = {
-        "ours": packed.step,
-        "ours, bfloat16": half.step,
+        "ours": Training(train, network, packed=packed).step,
+        "ours, bfloat16": Training(train, network, packed=packed, kind=HalfMLP).step,
         "one patch a step": one_by_one,
     }
-    seconds = alternate(contestants, turns=2 if quick else 15)
+    seconds = alternate(contestants, turns)
     faces = float(np.mean([len(patch.faces) for patch in train.patches]))
-    what = f"UV training, patches of {faces:,.0f} faces, {PACKED} packed, patches per second"
+    what = f"UV training, patches of {faces:,.0f} faces, {name}, {packed} packed"
     yield speed_up(what, seconds, "one patch a step", 3.0)
-    name = "ours, bfloat16"
-    yield speed_up(f"{what}, bfloat16", seconds, "one patch a step", ours=name)
+    ours = "ours, bfloat16"
+    yield speed_up(f"{what}, bfloat16", seconds, "one patch a step", ours=ours)
 
 
 def accuracy(quick: bool) -> Iterator[Figure]:
@@ -114,24 +130,15 @@ def accuracy(quick: bool) -> Iterator[Figure]:
     train, validation = examples(quick)
     budget = 0.3 if quick else BUDGET
     marks = np.linspace(0.6, 1.0, 5) * budget
-    packed, half, single = _trainings(train)
-    steps, ours = _losses(packed, validation, marks)
-    _, theirs = _losses(single, validation, marks)
+    packed = PACKED[-1]
+    steps, ours = _losses(Training(train, NARROW, packed=packed), validation, marks)
+    _, theirs = _losses(Training(train, NARROW, kind=PlainMLP), validation, marks)
+    half = Training(train, NARROW, packed=packed, kind=HalfMLP)
     rounded = _losses_after(half, validation, steps)
-    what = f"validation loss after {budget:.0f} s of training"
+    what = f"validation loss after {budget:.0f} s of training, 4 rounds, 32 wide, {packed} packed"
     yield _losses_ratio(what, "one patch a step", ours, theirs)
-    yield _losses_ratio(
-        f"validation loss in bfloat16 after {steps[-1]} steps", "float32", rounded, ours
-    )
-
-
-def _trainings(train: UVExamples) -> tuple[Training, Training, Training]:
-    """Ours, ours with layers in bfloat16, and the peer, from the same weights."""
-    return (
-        Training(train, packed=PACKED),
-        Training(train, packed=PACKED, kind=HalfMLP),
-        Training(train, packed=1, kind=PlainMLP),
-    )
+    what = f"validation loss in bfloat16 after {steps[-1]} steps of that"
+    yield _losses_ratio(what, "float32", rounded, ours)
 
 
 def _losses(

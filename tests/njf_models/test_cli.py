@@ -456,8 +456,8 @@ class Bomb(type(Path())):  # type: ignore[misc]
 
 
 def test_a_crash_is_one_file_s_failure(disk):
-    good = uv.Task(disk, None, None, "tutte", False, 1e-6, False, 1, False)
-    bad = uv.Task(Bomb("bomb.obj"), None, None, "tutte", False, 1e-6, False, 1, False)
+    good = uv.Task(disk, None, None, "tutte", "uv", False, 1e-6, False, 1, False)
+    bad = uv.Task(Bomb("bomb.obj"), None, None, "tutte", "uv", False, 1e-6, False, 1, False)
     with uv._Workers(1) as workers:
         records = [workers.submit(task).result() for task in (bad, good)]
     assert records[0]["error"] == "the process ended without a result (exit code 7)"

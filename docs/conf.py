@@ -32,6 +32,12 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 
+# `sphinx-build -b linkcheck docs build/links`, by hand before a release: it asks the network.
+linkcheck_ignore = [r"http://(127\.0\.0\.1|localhost)(:\d+)?"]  # the windows of `njf view`
+linkcheck_allowed_redirects = {r"https://doi\.org/.*": r".*"}  # what a DOI is for
+linkcheck_timeout = 30
+linkcheck_retries = 2
+
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
@@ -97,7 +103,8 @@ def visit_inline_math(translator: Any, node: nodes.math) -> None:
 
 def visit_block_math(translator: Any, node: nodes.math_block) -> None:
     """A formula on a line of its own."""
-    translator.body.append(convert(node.astext(), display="block"))
+    formula = convert(node.astext(), display="block")
+    translator.body.append(f'<div class="formula">{formula}</div>')
     raise nodes.SkipNode
 
 

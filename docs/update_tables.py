@@ -1,4 +1,4 @@
-"""Write the tables in README.md and docs/ from the JSON results beside this file.
+"""Write the tables in README.md, CONTRIBUTING.md and docs/ from the JSON results beside this file.
 
 A table stands between the lines `<!-- table:NAME -->` and `<!-- end -->`. `--check` only says
 whether anything would change.
@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
 
-from tests.benchmarks import report  # noqa: E402  (found by the line above)
+from tests import coverage_table  # noqa: E402  (found by the line above)
+from tests.benchmarks import report  # noqa: E402
 from tests.mutation import named, verdicts  # noqa: E402
 
 RESULTS = DOCS / "results"
@@ -62,7 +63,11 @@ def transforms() -> str:
         if "missing" not in kinds
         for what, cells in kinds.items()
     }
-    lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
+    # Where a long name may break.
+    titles = [
+        name.replace("torchsparsegradutils", "torch&shy;sparse&shy;gradutils") for name in columns
+    ]
+    lines = ["| | " + " | ".join(titles) + " |", "|---|" + "---|" * len(columns)]
     for name in results["transforms"]:
         row = [transforms_cell(cells[name]) for cells in columns.values()]
         lines.append(f"| {name} | " + " | ".join(row) + " |")
@@ -365,6 +370,8 @@ def uv_card() -> str:
     weights = DOCS.parent / "njf_models" / "weights"
     card = json.loads((weights / "uv.json").read_text())
     plain = {name: value for name, value in card.items() if isinstance(value, (str, int, float))}
+    # As code: a dollar sign of the shell would begin a formula.
+    plain["commands"] = "<br>".join(f"`{command}`" for command in plain["commands"].split(" ; "))
     return "\n".join(["| | |", "|---|---|", *(f"| {n} | {v} |" for n, v in plain.items())])
 
 
@@ -755,7 +762,40 @@ def data_cost() -> str:
     )
 
 
+def coverage() -> str:
+    """What of the packages the tests run, from `tests/coverage_table.py`."""
+    return coverage_table.table(json.loads((RESULTS / "coverage.json").read_text()))
+
+
+def gallery() -> str:
+    """Processor time of the examples: of all from `tests/benchmarks/gallery_times.py`, or training.
+
+    Those that train take a quarter of an hour and more. What they trained for they record; the
+    making of data and the evaluation come on top.
+    """
+    measured = json.loads((RESULTS / "gallery.json").read_text())
+    recorded = {"uv_train": "uv_train", "arap": "arap", "contact": "contact", "body_maps": "repose"}
+    rows = [
+        f"| `examples/{name}.py` | {minutes(result['cpu seconds'])} | – |"
+        for name, result in measured.items()
+    ]
+    for name, record in recorded.items():
+        training = json.loads((RESULTS / f"{record}.json").read_text())["training"]
+        costs = [training] if "cpu seconds" in training else list(training.values())
+        spent = sum(sum(v for k, v in cost.items() if "cpu seconds" in k) for cost in costs)
+        rows.append(f"| `examples/{name}.py` | – | {minutes(spent)} |")
+    head = ("| example | all of it | training of the run shown |", "|---|---|---|")
+    return "\n".join([*head, *rows])
+
+
+def minutes(seconds: float) -> str:
+    """A time, to two digits or so."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 TABLES = {
+    "coverage": coverage,
+    "gallery": gallery,
     "paper": paper,
     "arap": arap,
     "arap_speed": arap_speed,
@@ -804,7 +844,8 @@ def updated(text: str) -> str:
 def main() -> bool:
     """Update every page; true if `--check` found one to be stale."""
     stale = []
-    for path in (DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))):
+    at_the_root = [DOCS.parent / name for name in ("README.md", "CONTRIBUTING.md")]
+    for path in (*at_the_root, *sorted(DOCS.glob("*.md"))):
         text = path.read_text()
         if (new := updated(text)) != text:
             stale.append(path.name)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 
-from njf_models.commands import CommandError, UsageError
+from njf_models.commands import CommandError, UsageError, how_to_install
 
 # In the order of `njf --help`. Each is a module of `njf_models.commands` with
 # `add_parser(subparsers)` and `run(options) -> exit code`, light to import.
@@ -69,7 +69,7 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, CommandError):
         return str(error)
     if isinstance(error, ModuleNotFoundError):
-        return f"{error.name} is not installed: pip install 'diffpoisson[uv]'"
+        return how_to_install(error)
     text = " ".join(str(error).split()) or "no message"
     return f"{text} ({type(error).__name__}; --debug shows where)"
 

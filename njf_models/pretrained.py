@@ -47,6 +47,27 @@ def _load(name: str) -> UVNetwork | ReposeNetwork:
     return kind.load(_file(name, ".safetensors"))
 
 
+def load_uv_network(weights: Path | str) -> UVNetwork:
+    """A network for UV maps, of this package or one's own.
+
+    Args:
+        weights: a name as for `load_pretrained`; or a file, `.safetensors` of `UVNetwork.save` or
+            `.ckpt` of `njf train`.
+
+    Raises:
+        ValueError: there is no such file and no such name, or it is not for UV maps.
+    """
+    path = Path(weights)
+    if path.suffix and not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    if path.suffix == ".ckpt":
+        return UVNetwork.from_checkpoint(path)
+    network = UVNetwork.load(path) if path.suffix else load_pretrained(str(weights))
+    if not isinstance(network, UVNetwork):
+        raise ValueError(f"the weights {str(weights)!r} are not for UV maps; use 'uv'")
+    return network
+
+
 def card(name: str = "uv") -> dict[str, Any]:
     """The card of trained weights: data, licences, split, training and measured errors.
 
@@ -56,7 +77,9 @@ def card(name: str = "uv") -> dict[str, Any]:
     return dict(json.loads(_file(name, ".json").read_text()))
 
 
-def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any) -> dp.UVMap:
+def parameterize(
+    mesh: dp.Mesh, *, model: Path | str | UVNetwork = "uv", **options: Any
+) -> dp.UVMap:
     """A flip-free UV map of a surface, from a network's prediction for each chart.
 
     `diffpoisson.parameterize(mesh, network.start, ...)`: the prediction is repaired where it flips
@@ -66,16 +89,14 @@ def parameterize(mesh: dp.Mesh, *, model: str | UVNetwork = "uv", **options: Any
 
     Args:
         mesh: a surface in space, whose components are topological disks unless `cut`.
-        model: the name of trained weights for UV maps, or a network.
+        model: a network; or weights, by a name or a file as for `load_uv_network`.
         options: of `diffpoisson.parameterize`: cut, injective, tolerance, max_iterations.
 
     Raises:
         MeshError: see there.
         ValueError: there are no weights of that name, or they are not for UV maps.
     """
-    network = load_pretrained(model) if isinstance(model, str) else model
-    if not isinstance(network, UVNetwork):
-        raise ValueError(f"parameterize: the weights {model!r} are not for UV maps; use 'uv'")
+    network = model if isinstance(model, UVNetwork) else load_uv_network(model)
     return dp.parameterize(mesh, network.start, **options)
 
 

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from diffpoisson import testing
-from tests.benchmarks import figures, harness, limits, maps, report
+from tests import coverage_table
+from tests.benchmarks import figures, gallery_times, harness, limits, maps, report
 from tests.benchmarks.figures import Spread
 
 THEMES = (
@@ -138,3 +139,27 @@ def test_energies_of_maps_know_scales_mirrors_charts_and_flips():
     assert maps.energy(V, F, stretched) == pytest.approx(2 * np.sqrt(5 * 1.25))
     flat[12] += [2.0, 0]  # an inner vertex far outside of its star
     assert maps.energy(V, F, flat[F]) is None
+
+
+def test_coverage_is_counted_over_files():
+    """A package that is run in half, one in full: shares of sums, not means of shares."""
+
+    def file(*counts: int) -> dict:
+        return {"summary": dict(zip(coverage_table.COUNTS, counts, strict=True))}
+
+    half = file(100, 50, 20, 10) | {"missing_lines": list(range(50))}
+    full = file(300, 0, 20, 0) | {"missing_lines": []}
+    measured = {
+        "meta": {"version": "7", "branch_coverage": True},
+        "files": {"diffpoisson/a.py": half, "njf_models/b.py": full},
+    }
+    rows = coverage_table.table(coverage_table.boiled_down(measured)).split("\n")[2:]
+    assert rows[0] == "| `diffpoisson` | 100 | 50.0 | 20 | 50.0 | 50.0 |"
+    assert rows[1] == "| `njf_models` | 300 | 100.0 | 20 | 100.0 | 100.0 |"
+    assert rows[2] == "| both | 400 | 87.5 | 40 | 75.0 | 86.4 |"
+
+
+@pytest.mark.slow
+def test_an_example_is_timed():
+    result = gallery_times.measure("fit_source", "--edge", "0.6", "--steps", "1")
+    assert 0.5 < result["cpu seconds"] < 1.2 * result["seconds"] + 1

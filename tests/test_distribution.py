@@ -84,3 +84,17 @@ def test_metadata(site):
         name = re.split(r"[^\w-]", line)[0]
         assert name == metadata["Name"] or f"\n{name}==" in pins, f"{name} is not pinned"
     assert {"docs", "examples", "test", "train", "uv"} <= extras
+
+
+def test_citation():
+    """What the schema 1.2.0 of citation files requires, and DOIs without their resolver."""
+    yaml = pytest.importorskip("yaml")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0"
+    for work in (citation, *citation["references"]):
+        assert {"title", "type", "authors"} <= set(work)
+        for author in work["authors"]:
+            assert set(author) in ({"name"}, {"family-names", "given-names"})
+        assert re.fullmatch(r"10\.\d{4,}/\S+", work.get("doi", "10.1145/0"))
+    assert citation["message"]
+    assert citation["type"] in ("software", "dataset")

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from njf_models.commands import CommandError, UsageError
+from njf_models.commands import CommandError, UsageError, how_to_install
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -98,9 +98,7 @@ def _view(
     try:
         from njf_models.repose_viewer import ReposeViewer  # noqa: PLC0415  (needs viser)
     except ModuleNotFoundError as error:
-        raise CommandError(
-            f"{error.name} is not installed: pip install 'diffpoisson[view]'"
-        ) from error
+        raise CommandError(how_to_install(error)) from error
 
     def save(vertices: Tensor) -> None:
         _write(options.output, vertices, mesh.faces)

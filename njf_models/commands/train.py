@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from njf_models.datasets.store import UVStore
+    from njf_models.trained import Inputs
 
 _EXAMPLE = """\
 examples:
@@ -78,6 +79,7 @@ def run(options: argparse.Namespace) -> int:
     """Train until the steps or minutes are over."""
     import lightning  # noqa: PLC0415  (seconds to import)
 
+    from njf_models.experiments import quiet  # noqa: PLC0415
     from njf_models.trained import Inputs  # noqa: PLC0415
     from njf_models.training import (  # noqa: PLC0415
         NJFTraining,
@@ -87,6 +89,8 @@ def run(options: argparse.Namespace) -> int:
         make_trainer,
     )
 
+    if not options.debug:
+        quiet()
     options.out.mkdir(parents=True, exist_ok=True)
     lightning.seed_everything(options.seed, verbose=False)
     parts = _split(options)
@@ -120,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
         kind=kind,
     )
     if options.init is not None:
-        _begin_with(module.model, model, options.init)
+        _begin_with(module.model, model, inputs, options.init)
     trainer = make_trainer(
         options.out,
         minutes=options.minutes,
@@ -134,25 +138,21 @@ def run(options: argparse.Namespace) -> int:
         loader(UVExamples(validation, **seen), 16),
         ckpt_path=last_checkpoint(options.out),
     )
+    print(f"best weights, for `njf uv --model`: {options.out / 'checkpoints' / 'best.ckpt'}")
     return 0
 
 
-def _begin_with(model: nn.Module, arguments: dict[str, Any], weights: str) -> None:
-    """Load weights that are known by name or in a file."""
-    from njf_models.pretrained import load_pretrained  # noqa: PLC0415
-    from njf_models.repose_network import ReposeNetwork  # noqa: PLC0415
-    from njf_models.uv_network import UVNetwork  # noqa: PLC0415
+def _begin_with(model: nn.Module, arguments: dict[str, Any], inputs: Inputs, weights: str) -> None:
+    """Load weights that are known by name or in a file, of a network made and fed like this one."""
+    from njf_models.pretrained import load_uv_network  # noqa: PLC0415
 
-    path = Path(weights)
-    network: UVNetwork | ReposeNetwork
-    if path.suffix == ".ckpt":
-        network = UVNetwork.from_checkpoint(path)
-    else:
-        network = UVNetwork.load(path) if path.suffix else load_pretrained(weights)
-    if network.arguments != arguments:
-        raise UsageError(
-            f"--init {weights} is of a network with {network.arguments}; ask for these"
-        )
+    network = load_uv_network(weights)
+    # PointNet takes any number of points; a network that diffuses has learned of its eigenpairs.
+    theirs = network.arguments | {"eigenpairs": network.inputs.n_eigenpairs}
+    ours = arguments | {"eigenpairs": inputs.n_eigenpairs}
+    if other := [name for name in {**theirs, **ours} if theirs.get(name) != ours.get(name)]:
+        said = ", ".join(f"{name} {theirs.get(name)}, not {ours.get(name)}" for name in other)
+        raise UsageError(f"--init {weights} is of a network with {said}; train with its options")
     model.load_state_dict(network.model.state_dict())
 
 

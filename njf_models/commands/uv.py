@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from njf_models.commands import CommandError, UsageError
+from njf_models.commands import CommandError, UsageError, how_to_install
 
 _DESCRIPTION = """\
 Give a mesh UVs: cut into charts where it is no disk, flattened with little distortion, no triangle
@@ -79,6 +79,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         default="network",
         help="what makes the first map of a chart (default: network)",
     )
+    add(
+        "--model",
+        default="uv",
+        metavar="WEIGHTS",
+        help="the network's: a name, or a .safetensors or .ckpt of `njf train` (default: uv)",
+    )
     add("--no-cut", action="store_true", help="fail where the mesh is no disk, instead of cutting")
     add(
         "--tolerance",
@@ -128,6 +134,7 @@ class Task:
     output: Path | None
     report: Path | None
     start: str
+    model: str
     cut: bool
     tolerance: float
     checkerboard: bool
@@ -144,6 +151,7 @@ def _task(
         output,
         page,
         options.start,
+        options.model,
         not options.no_cut,
         options.tolerance,
         options.checkerboard,
@@ -251,6 +259,8 @@ def convert(task: Task) -> dict[str, Any]:
         record |= _convert(task) | {"status": "ok"}
     except (MeshFileError, MeshError, CommandError) as error:
         record["error"] = str(error)
+    except ModuleNotFoundError as error:
+        record["error"] = how_to_install(error)
     except Exception as error:  # one bad file must not end a batch
         if task.debug:
             raise
@@ -286,13 +296,9 @@ def _parameterize(mesh: Any, task: Task) -> Any:
 
     if task.start == "tutte":
         return dp.parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
-    try:
-        from njf_models import parameterize  # noqa: PLC0415
-    except ModuleNotFoundError:
-        raise
-    except ImportError as error:
-        raise CommandError("this version has no trained network: use --start tutte") from error
-    return parameterize(mesh, cut=task.cut, tolerance=task.tolerance)
+    from njf_models import parameterize  # noqa: PLC0415
+
+    return parameterize(mesh, model=task.model, cut=task.cut, tolerance=task.tolerance)
 
 
 def _figures(file: Any, cleaned: Any, uvmap: Any) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from njf_models.commands import CommandError
+from njf_models.commands import CommandError, how_to_install
 
 _EPILOG = """\
 examples:
@@ -40,9 +40,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         from njf_models.viewer import Viewer  # noqa: PLC0415  (needs viser)
     except ModuleNotFoundError as error:
-        raise CommandError(
-            f"{error.name} is not installed: pip install 'diffpoisson[view]'"
-        ) from error
+        raise CommandError(how_to_install(error)) from error
 
     try:
         file = read_mesh_file(options.mesh)

@@ -74,7 +74,9 @@ class UVStore(Sequence[UVPatch], Dataset[UVPatch]):
         self.folder = Path(folder)
         paths = sorted((self.folder / "shards").glob(f"*{_SUFFIX}"))
         if not paths:
-            raise StoreError(f"UVStore: no shard in {self.folder}; build it with build_store")
+            raise StoreError(
+                f"UVStore: no shard in {self.folder}; build it with `njf data` or `build_store`"
+            )
         self.shards = [_Shard.open(path) for path in paths]
         self.counts: Counter[str] = Counter()
         for shard in self.shards:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import trimesh
 
 import diffpoisson as dp
 from njf_models.cli import main
-from njf_models.commands import uv
+from njf_models.commands import how_to_install, info, uv
 from njf_models.meshfiles import read_mesh_file
 from tests import meshes
 
@@ -167,6 +168,40 @@ def test_a_fault_of_ours_is_one_line_too(tmp_path, monkeypatch, capsys):
 # ------------------------------------------------------- one file
 
 
+def test_a_missing_extra_is_named(disk, monkeypatch, capsys):
+    def broken(*_: object) -> None:
+        raise ModuleNotFoundError("No module named 'trimesh'", name="trimesh")
+
+    monkeypatch.setattr(info, "mesh_facts", broken)
+    monkeypatch.setattr(uv, "_convert", broken)
+    remedy = "trimesh is not installed: pip install 'diffpoisson[uv]'\n"
+    assert main(["info", str(disk)]) == main(["uv", str(disk)]) == 1
+    assert capsys.readouterr().err == f"njf info: {remedy}njf uv: {disk}: {remedy}"
+
+
+@pytest.mark.parametrize("extra", ["uv", "view", "train"])
+def test_extras_are_as_the_package_declares_them(extra):
+    """Each of its packages is looked for in it; one of nobody's is asked for by its name."""
+    text = (ROOT / "pyproject.toml").read_text()
+    declared = tomllib.loads(text)["project"]["optional-dependencies"][extra]
+    names = {re.split(r"[^\w-]", line)[0].replace("pillow", "PIL") for line in declared}
+    for name in names - {"diffpoisson"}:
+        remedy = how_to_install(ModuleNotFoundError(name=f"{name}.part"))
+        assert remedy == f"{name} is not installed: pip install 'diffpoisson[{extra}]'"
+    assert how_to_install(ModuleNotFoundError(name="ray")).endswith(": pip install ray")
+
+
+def test_a_reader_who_leaves_is_no_error(disk):
+    """As `njf info FILE | head -0` does."""
+    command = [sys.executable, "-m", "njf_models.cli", "info", str(disk)]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    process.stdout.close()
+    assert (process.stderr.read(), process.wait(timeout=120)) == ("", 1)
+    process.stderr.close()
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
 def test_one_file(disk, tmp_path, capsys, suffix):
     output = tmp_path / "new" / f"out{suffix}"
@@ -310,7 +345,9 @@ def test_the_network_is_the_default(disk, monkeypatch, capsys):
     monkeypatch.setattr(njf_models, "parameterize", parameterize, raising=False)
     assert main(["uv", str(disk)]) == 0
     assert main(["uv", str(disk), "--no-cut", "--tolerance", "1e-3"]) == 0
-    assert calls == [{"cut": True, "tolerance": 1e-6}, {"cut": False, "tolerance": 1e-3}]
+    uv = {"model": "uv"}
+    expected = [{"cut": True, "tolerance": 1e-6}, {"cut": False, "tolerance": 1e-3}]
+    assert calls == [uv | options for options in expected]
 
 
 # ------------------------------------------------------- folders
@@ -419,8 +456,8 @@ class Bomb(type(Path())):  # type: ignore[misc]
 
 
 def test_a_crash_is_one_file_s_failure(disk):
-    good = uv.Task(disk, None, None, "tutte", False, 1e-6, False, 1, False)
-    bad = uv.Task(Bomb("bomb.obj"), None, None, "tutte", False, 1e-6, False, 1, False)
+    good = uv.Task(disk, None, None, "tutte", "uv", False, 1e-6, False, 1, False)
+    bad = uv.Task(Bomb("bomb.obj"), None, None, "tutte", "uv", False, 1e-6, False, 1, False)
     with uv._Workers(1) as workers:
         records = [workers.submit(task).result() for task in (bad, good)]
     assert records[0]["error"] == "the process ended without a result (exit code 7)"

@@ -15,6 +15,7 @@ from njf_models.datasets.patches import (
     PatchSampler,
     align,
     clean_boundary,
+    defect,
     dual_graph,
 )
 from njf_models.datasets.sources import CSGParts
@@ -92,6 +93,30 @@ def test_a_patch_is_a_geodesic_ball() -> None:
     assert (distance >= straight - 1e-12).all()
     assert (distance <= 1.6 * straight + 0.05).all()
     assert patch.flatness == pytest.approx(1)
+
+
+def test_a_patch_swallows_the_spike_it_has_grown_around() -> None:
+    """Its tip is far away; without it the patch had a hole, which is left where room is short."""
+    flat, faces = meshes.planar_disk(0, 30)
+    away = np.linalg.norm(flat - flat.mean(0), axis=1)
+    spike = away < 0.2 * away.max()
+    vertices = np.c_[flat, np.where(spike, 30 * (0.2 * away.max() - away), 0)]
+    seed_face = int(np.abs(away[faces].mean(axis=1) - 0.35 * away.max()).argmin())
+    is_spike = spike[faces].any(axis=1)
+    wanted = len(faces) - int(is_spike.sum()) - 150  # all around, and nothing of the tip
+
+    sampler = PatchSampler(vertices, faces, PatchOptions(100, len(faces)))
+    chosen = sampler.nearest(seed_face, wanted)
+    assert defect(faces[chosen]) == "has holes"
+    patch = sampler._cut(chosen)
+    assert patch.mesh.is_disk
+    kept = patch.mesh.n_faces
+    with_spike = np.union1d(chosen, np.flatnonzero(is_spike))
+    assert kept >= len(clean_boundary(faces[with_spike])) > wanted
+
+    sampler = PatchSampler(vertices, faces, PatchOptions(100, wanted))
+    with pytest.raises(PatchRejectedError, match="has holes"):
+        sampler._cut(chosen)
 
 
 def test_distance_goes_through_the_midpoints_of_shared_edges() -> None:

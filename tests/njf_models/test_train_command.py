@@ -67,6 +67,49 @@ def test_data_and_training_by_their_commands(tmp_path, capsys):
     assert (network.kind, network.inputs.n_eigenpairs) == ("diffusion+njf", 12)
     assert moves(network)
 
+    # Begun with these weights, one step goes hardly anywhere; other networks are refused.
+    train[2], begun = str(tmp_path / "begun"), last_checkpoint(tmp_path / "diffusing")
+    small = [*train, *net, "--rounds", "2", "--steps", "1", "--rate", "1e-9"]
+    network.save(tmp_path / "begun.safetensors")
+    for weights in (begun, tmp_path / "begun.safetensors"):
+        assert main([*small, "--init", str(weights)]) == 0
+        after = UVNetwork.from_checkpoint(last_checkpoint(tmp_path / "begun"))
+        for name, value in network.model.state_dict().items():
+            torch.testing.assert_close(after.model.state_dict()[name], value, atol=1e-7, rtol=0)
+        train[2] = small[2] = str(tmp_path / "again")
+    capsys.readouterr()
+    small[small.index("--eigenpairs") + 1] = "13"
+    small[2] = str(tmp_path / "refused")
+    for weights, difference in ((str(begun), "eigenpairs 12, not 13"), ("uv", "net_width 32, not")):
+        assert main([*small, "--init", weights]) == 2
+        assert f"--init {weights} is of a network with" in (said := capsys.readouterr().err)
+        assert difference in said
+
+    # It maps files at once, from either kind of file.
+    disk = tmp_path / "disk.ply"
+    trimesh.Trimesh(*meshes.disk(0, 12), process=False).export(disk)
+    for weights in (begun, tmp_path / "begun.safetensors"):
+        written = tmp_path / f"by{weights.suffix}.obj"
+        assert main(["uv", str(disk), str(written), "--model", str(weights)]) == 0
+        assert "certified" in capsys.readouterr().out
+    by = [(tmp_path / f"by{suffix}.obj").read_text() for suffix in (".ckpt", ".safetensors")]
+    assert by[0].split("\nv ", 1)[1] == by[1].split("\nv ", 1)[1]
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ("nothing", "there are no weights 'nothing', but repose, uv"),
+        ("repose", "the weights 'repose' are not for UV maps; use 'uv'"),
+        ("none.ckpt", "there is no file none.ckpt"),
+    ],
+)
+def test_other_weights_are_refused_by_name(weights, message, tmp_path, capsys):
+    disk = tmp_path / "disk.ply"
+    trimesh.Trimesh(*meshes.disk(0, 5), process=False).export(disk)
+    assert main(["uv", str(disk), "--model", weights]) == 1
+    assert message in capsys.readouterr().err
+
 
 def test_data_from_a_cluster_by_its_address(tmp_path, capsys):
     distributed = pytest.importorskip("distributed")

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import re
+import statistics
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -207,15 +208,20 @@ def uv() -> str:
     after, steps, rates = (
         results[name] for name in ("parameterize", "iterations to 1%, hardest quarter", "rates")
     )
-    speed = {name: cells[1] for name, cells in rates["patches per second"].items()}
+    speed = rates["patches per second"]
+    over_slim = [record["energy_over_slim"] for record in results["records"]]
+    theirs, ours = zip(*_hardest_iterations(results["records"]), strict=True)
     more = {
         "after `parameterize`: patches with a flip": after["patches with a flip"],
         "not certified": after["not certified"],
         "started from the network's map, %": 100 * after["from the network"],
         "energy over converged SLIM's, median": f"{after['energy over SLIM, median']:.5f}",
+        "its quartiles": " … ".join(f"{value:.5f}" for value in _quartiles(over_slim)),
         "energy over converged SLIM's, 99%": f"{after['energy over SLIM, p99']:.5f}",
-        "SLIM iterations to 1%, hardest quarter: from Tutte's map": steps["from Tutte"],
-        "the same from the network's": steps["ours"],
+        "SLIM iterations to 1%, hardest quarter: from Tutte's map, median (quartiles)": _spread(
+            steps["from Tutte"], theirs
+        ),
+        "the same from the network's": _spread(steps["ours"], ours),
         "raw maps over 20 SLIM iterations, patches per second": list(
             rates["prepared over SLIM"].values()
         )[-1],
@@ -226,7 +232,10 @@ def uv() -> str:
         for name, value in more.items()
     ]
     head = f"| {results['patches']} patches of {len(results['meshes'])} unseen meshes"
-    speeds = ", ".join(f"{name} {number(value)}" for name, value in speed.items())
+    speeds = ", ".join(
+        f"{name} {number(median)} ({number(low)} … {number(high)})"
+        for name, (low, median, high) in speed.items()
+    )
     return "\n".join(
         [
             f"{head} | filtered | all | paper, other data |",
@@ -234,9 +243,27 @@ def uv() -> str:
             *rows,
             "",
             f"Patches per second on {rates['threads']} thread(s), {rates['faces per patch']:.0f} "
-            f"faces per patch, medians of {rates['rounds']} turns: {speeds}.",
+            f"faces per patch, medians (least … most) of {rates['rounds']} turns: {speeds}.",
         ]
     )
+
+
+def _quartiles(values: Sequence[float]) -> list[float]:
+    first, _, third = statistics.quantiles(values, n=4, method="inclusive")
+    return [first, third]
+
+
+def _spread(median: float, values: Sequence[float]) -> str:
+    return f"{number(median)} ({' … '.join(map(number, _quartiles(values)))})"
+
+
+def _hardest_iterations(records: list[dict[str, Any]]) -> list[tuple[int, int]]:
+    """From Tutte's map and from ours; see `quartile_of_iterations` in `uv_results.py`."""
+    pairs = []
+    for record in records:
+        theirs, ours = record["iterations_from_tutte"], record.get("iterations_from_network")
+        pairs.append((theirs, theirs if ours is None else ours))
+    return sorted(pairs, reverse=True)[: -(-len(pairs) // 4)]
 
 
 def uv_rounds() -> str:

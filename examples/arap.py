@@ -51,9 +51,14 @@ from njf_models.elastic_maps import (
 from njf_models.evaluation import format_table
 from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.features import Shape
-from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
+from njf_models.training import NJFTraining, finished, last_checkpoint, load_checkpoint, make_trainer
 
-KINDS = {"njf": "ours", "field": "the paper's field", "global": "global MLP"}  # in tables
+KINDS = {  # and names in tables
+    "modal": "ours",
+    "global": "global MLP",
+    "pinned": "global MLP, trained pinned",
+    "field": "the paper's field",
+}
 SEEDS = {"train": 0, "validation": 1, "test": 2}
 N_VALIDATIONS = 10
 
@@ -143,43 +148,38 @@ def make_maps(solid: Solid, options: argparse.Namespace) -> dict[str, ArapMaps]:
 
 def batches(kind: str, maps: ArapMaps, shape: Shape) -> ElasticBatches:
     """What a model learns from; the global one can't make use of a few faces alone."""
-    if kind == "njf":  # in which a map more costs little
-        options = {"n_targets": 16, "n_faces": 256, "n_sampled_targets": 128}
-        return ElasticBatches(maps, shape, sampled=64, shuffle=True, **options)
     if kind == "field":
         return ElasticBatches(maps, shape, sampled=64, shuffle=True)
     return ElasticBatches(maps, shape, n_targets=32, shuffle=True)
 
 
-def make_module(kind: str, steps: int, shape: Shape, options: argparse.Namespace) -> NJFTraining:
-    lightning.seed_everything(options.seed, verbose=False)
-    model = {"parameters": 18}
-    if kind == "global":
-        model |= {"n_faces": shape.mesh.n_faces, "width": options.global_width}
-        return NJFTraining(model, steps=steps, kind=kind)
-    model |= {"face_features": 6, "point_features": 0}
-    model |= {"rank": options.rank} if kind == "njf" else {}
-    return NJFTraining(model, steps=steps)
-
-
-def plan(kind: str, train: ArapMaps, shape: Shape, options: argparse.Namespace) -> int:
-    """Steps that take the wanted CPU time, a multiple of the validations: one follows the last."""
-    data, path = batches(kind, train, shape), options.out / f"{kind}-steps.json"
-    turns = [data[i] for i in range(data.period)]
-    return planned_steps(
-        path, make_module(kind, 1, shape, options), turns, options.minutes, N_VALIDATIONS
-    )
+def make_module(kind: str, steps: int, shape: Shape, seed: int, width: int) -> NJFTraining:
+    lightning.seed_everything(seed, verbose=False)
+    if kind == "field":
+        model = {"parameters": 18, "face_features": 6, "point_features": 0}
+        return NJFTraining(model, steps=steps)
+    model = {"parameters": 18, "n_faces": shape.mesh.n_faces, "width": width}
+    return NJFTraining(model, steps=steps, kind="global")
 
 
 def fit(
-    kind: str, steps: int, maps: dict[str, ArapMaps], shape: Shape, options: argparse.Namespace
+    kind: str, seed: int, maps: dict[str, ArapMaps], shape: Shape, options: argparse.Namespace
 ) -> Path:
-    """Train, going on from the last checkpoint if there is one; the best by validation loss."""
-    folder = options.out / kind
+    """Train, going on from the last checkpoint if there is one; the best by validation loss.
+
+    As many steps as take the wanted CPU time, a multiple of the validations: one follows the last.
+    """
+    data, path = batches(kind, maps["train"], shape), options.out / f"{kind}-steps.json"
+    turns = [data[i] for i in range(data.period)]
+    module = make_module(kind, 1, shape, seed, options.global_width)
+    steps = planned_steps(path, module, turns, options.minutes, N_VALIDATIONS)
+    folder = options.out / f"{kind}-{seed}"
+    if finished(folder, steps):
+        return folder / "checkpoints" / "best.ckpt"
     trainer = make_trainer(folder, steps=steps, validate_every=steps // N_VALIDATIONS)
     trainer.fit(
-        make_module(kind, steps, shape, options),
-        elastic_loader(batches(kind, maps["train"], shape)),
+        make_module(kind, steps, shape, seed, options.global_width),
+        elastic_loader(data),
         elastic_loader(ElasticBatches(maps["validation"], shape, n_targets=20)),
         ckpt_path=last_checkpoint(folder),
     )

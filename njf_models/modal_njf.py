@@ -3,8 +3,8 @@
 The matrices are a sum Σₖ hₖ Tₖ of functions on the surface, and the Poisson solve is linear: it is
 done once for each function, not for each map. In each further round a network reads how far the
 Jacobians of the map are from isometries, pooled over the surface against the functions' own
-Jacobians, ∂/∂hₖ of ½ Σ |t| ‖J - Q‖²: the gradient of the surface's as-rigid-as-possible energy. What
-pulls at a map from all sides tells a network more of where its limbs should be than their ends do.
+Jacobians, ∂/∂hₖ of ½ Σ |t| ‖J - Q‖²: the gradient of the surface's energy of as-rigid-as-possible
+maps. What strains a map tells a network more of where it should be than its code alone does.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Basis(NamedTuple):
 class ModalNJF(WholeShapes, CodedModel):
     """Code ↦ coefficients; R = J + Σₖ hₖ Tₖ B, J that of the harmonic map; pinned Poisson solve.
 
-    For shapes with handles, see `Shape.with_handles`. T is a network of each face's centroid, normal
-    and of the harmonic weights of the handles there, so that any triangulation has it.
+    For shapes with handles, see `Shape.with_handles`. T is a network of each face's centroid and
+    normal, and of the harmonic weights of the handles there, so that any triangulation has it.
     `modal_training.fit_modal` trains it.
 
     Args:
@@ -119,7 +119,7 @@ class ModalNJF(WholeShapes, CodedModel):
         """
         handles, mesh, c = _handles(shape), shape.mesh, self.output_dim
         P = self.of_face(self.face_inputs(shape)).view(-1, self.rank, c, 3).transpose(0, 1)
-        fields = dp.restrict(P, shape.frames)
+        fields = dp.restrict(P.to(shape.frames.dtype), shape.frames)
         nought = handles.origin.new_zeros(self.rank, *handles.origin.shape)
         maps = handles.solver(fields, pins=nought)
         faces, weights = self._read_faces(mesh)
@@ -136,6 +136,13 @@ class ModalNJF(WholeShapes, CodedModel):
         generator = torch.Generator().manual_seed(0)
         faces = dp.sample_surface(mesh, self.reads, generator=generator).faces
         return faces, torch.full((self.reads,), 1 / self.reads)
+
+    def with_rounds(self, rounds: int) -> ModalNJF:
+        """The same network, stopped after so many rounds, or going on."""
+        require_integer("ModalNJF", "rounds", rounds, least=1)
+        model = copy.copy(self)
+        model.rounds = rounds
+        return model
 
     def on(self, shape: Shape) -> ModalNJF:
         """A network for inference on this shape, for many maps: its functions are kept."""
@@ -203,8 +210,8 @@ class ModalNJF(WholeShapes, CodedModel):
         J = dp.jacobians(shape.mesh, start)
         predictions = []
         for h in self.coefficients(shape, basis, codes):
-            R = (J + _combined(h, basis.fields)).unflatten(0, batch)
-            phi = (start + _combined(h, basis.maps)).unflatten(0, batch)
+            R, phi = J + _combined(h, basis.fields), start + _combined(h, basis.maps)
+            R, phi = R.view(*batch, *R.shape[1:]), phi.view(*batch, *phi.shape[1:])
             predictions.append(Prediction(dp.extend(R, shape.frames), R, phi))
         return predictions
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,9 +24,8 @@ from njf_models.handles import Handles
 from njf_models.losses import VERTEX_WEIGHT
 from njf_models.modal_njf import Basis, ModalNJF
 
-SHARES = (0.2, 0.3, 0.5)  # of the time: functions, first guess, corrections
+SHARES = (0.2, 0.3, 0.5)  # of the time: functions, first guess, corrections, if there are any
 _BATCH = 128
-_FACES = 512
 _NOISE = 1.5
 
 
@@ -71,7 +72,8 @@ def fit_modal(
     handles, start = shape.handles, time.process_time()
     if handles is None:
         raise ValueError("fit_modal: this needs a shape with handles")
-    seconds = [60 * minutes * share for share in SHARES]
+    shares = np.array(SHARES if model.rounds > 1 else SHARES[:2])
+    seconds = 60 * minutes * shares / shares.sum()
     weights = _Weights.of(shape)
     missing = _missing(handles, train)
     _fit_functions(model, shape, _principal(weights, shape, missing, model.rank), seconds[0])
@@ -113,13 +115,54 @@ def fit_modal(
             return (model.corrected(train.code[at], h, reading) - best[at]).square().sum(-1).mean()
 
         networks = nn.ModuleList([model.correction, model.step])
-        _descend(networks, len(best), corrected_error, start + sum(seconds), learning_rate)
+        _descend(networks, len(best), corrected_error, start + seconds.sum(), learning_rate)
         with torch.no_grad():
             rounds = model.coefficients(shape, basis, validation.code)
         errors = ", ".join(f"{(h - held_out).square().sum(-1).mean():.3g}" for h in rounds)
         progress(f"rounds: squared errors {errors}")
     model.eval()
     return time.process_time() - start
+
+
+def modal_in(
+    folder: Path,
+    arguments: dict[str, Any],
+    shape: Shape,
+    train: KnownMaps,
+    validation: KnownMaps,
+    *,
+    minutes: float,
+    seed: int,
+) -> tuple[ModalNJF, dict[str, float]]:
+    """The model that a folder keeps, trained now if it keeps none; and what its training took.
+
+    Args:
+        folder: for `model.pt`.
+        arguments: of `ModalNJF`.
+        shape: with handles.
+        train: as of `fit_modal`, like the rest.
+        validation: the same.
+        minutes: of CPU time.
+        seed: of weights and batches.
+    """
+    path = folder / "model.pt"
+    if not path.exists():
+        torch.manual_seed(seed)
+        model = ModalNJF(**arguments)
+        start = time.perf_counter()
+        seconds = fit_modal(model, shape, train, validation, minutes=minutes)
+        cost = {"cpu seconds": seconds, "seconds": time.perf_counter() - start}
+        folder.mkdir(parents=True, exist_ok=True)
+        torch.save({"arguments": arguments, "state": model.state_dict(), "cost": cost}, path)
+    return load_modal(path)
+
+
+def load_modal(path: Path) -> tuple[ModalNJF, dict[str, float]]:
+    """A model that `modal_in` kept, and what its training took."""
+    kept = torch.load(path, weights_only=True)
+    model = ModalNJF(**kept["arguments"])
+    model.load_state_dict(kept["state"])
+    return model.eval(), kept["cost"]
 
 
 def _descend(
@@ -193,7 +236,10 @@ def _fit_functions(
     _descend(model.of_face, len(inputs), error, start + 0.95 * seconds, 3e-3)
     with torch.no_grad():
         x = nn.Sequential(*hidden)(inputs)
-        x = torch.cat([x, x.new_ones(len(x), 1)], dim=1) * shape.face_weights.sqrt().float()[:, None]
+        x = (
+            torch.cat([x, x.new_ones(len(x), 1)], dim=1)
+            * shape.face_weights.sqrt().float()[:, None]
+        )
         y = target * shape.face_weights.sqrt().float()[:, None]
         solution = torch.linalg.lstsq(x, y, driver="gelsd").solution
         last.weight[:count], last.bias[:count] = solution[:-1].T, solution[-1]

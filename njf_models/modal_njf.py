@@ -72,6 +72,12 @@ class ModalNJF(WholeShapes, CodedModel):
             moved all alike, they move the map alone.
     """
 
+    mean: Tensor
+    scale: Tensor
+    reading_mean: Tensor
+    reading_scale: Tensor
+    step_scale: Tensor
+
     def __init__(
         self,
         parameters: int,

@@ -191,8 +191,8 @@ def learned(maps, shape):
     model = ModalNJF(6, 6, rank=12, width=32, code_width=64)
     known, unseen = (KnownMaps(maps.parameters[x], maps.positions[x]) for x in SPLIT)
     said: list[str] = []
-    seconds = fit_modal(model, shape, known, unseen, minutes=0.05, progress=said.append)
-    assert 3 <= seconds < 6
+    seconds = fit_modal(model, shape, known, unseen, minutes=0.04, progress=said.append)
+    assert 2.4 <= seconds < 5
     assert len(said) == 2
     return model.requires_grad_(False)
 

@@ -149,7 +149,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--held-out", type=int, default=100, metavar="N", help="to validate, and to test (100)")
     add("--minutes", type=float, default=2, help="of CPU time for each model (2)")
     add("--rank", type=int, default=96, help="functions of our field (96)")
-    add("--rounds", type=int, default=3, help="predictions of our field (3)")
+    add("--rounds", type=int, default=5, help="predictions of our field (5)")
     add("--global-width", type=int, default=512, help="of the global MLP's (512)")
     add("--timed", type=int, default=3, metavar="N", help="test maps to time the solver on (3)")
     add("--models", nargs="+", choices=KINDS, default=["modal", "global"], help="to train")
@@ -207,16 +207,16 @@ def fit(
     folder = options.out / f"{kind}-{seed}"
     if kind == "modal":
         known = {name: KnownMaps(x.parameters, x.positions) for name, x in maps.items()}
-        sizes = {"rank": options.rank, "rounds": options.rounds}
-        return modal_in(
+        model, cost = modal_in(
             folder,
-            {"parameters": 18, "amounts": 18, "relative": True, **sizes},
+            {"parameters": 18, "amounts": 18, "relative": True, "rank": options.rank},
             shape,
             known["train"],
             known["validation"],
             minutes=options.minutes,
             seed=seed,
         )
+        return model.with_rounds(options.rounds), cost  # training is the same for all
     data, path = batches(kind, maps["train"], shape), options.out / f"{kind}-steps.json"
     turns = [data[i] for i in range(data.period)]
     module = make_module(kind, 1, shape, seed, options.global_width)

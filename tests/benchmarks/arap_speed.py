@@ -84,10 +84,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder with the solid (RUN/data)")
     parser.add_argument("--levels", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--maps", type=int, default=5, help="on the coarsest; then fewer")
+    parser.add_argument("--rounds", type=int, default=5, help="predictions of our field (5)")
     parser.add_argument("--out", type=Path, default=RESULT)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    model, _ = load_modal(options.run / "modal-0" / "model.pt")
+    model = load_modal(options.run / "modal-0" / "model.pt")[0].with_rounds(options.rounds)
     solid = load_solid((options.data or options.run / "data") / "solid.safetensors")
     results = {}
     for level in range(max(options.levels) + 1):

@@ -165,7 +165,7 @@ def fit(
             ckpt_path=last_checkpoint(folder),
         )
     best = folder / "checkpoints" / "best.ckpt"
-    return load_checkpoint(best), {"steps": steps, **training_cost(best)}
+    return load_checkpoint(best), {"steps": float(steps), **training_cost(best)}
 
 
 def draw(

@@ -6,7 +6,7 @@ import argparse
 import logging
 import platform
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +37,11 @@ def training_cost(checkpoint: Path) -> dict[str, float | None]:
     return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
 
 
-def mean(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+def mean(rows: Sequence[Mapping[str, float | int]]) -> dict[str, float]:
     """The mean of each column."""
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def spread(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+def spread(rows: Sequence[Mapping[str, float | int]]) -> dict[str, float]:
     """The largest minus the smallest value of each column, over seeds."""
     return {name: float(np.ptp([row[name] for row in rows])) for name in rows[0]}

@@ -282,7 +282,9 @@ def draw(
         at = int(order[round(percentile / 100 * (len(order) - 1))])
         errors = ", ".join(f"{of_model[at].l2_v:.2f}" for of_model in records.values())
         title = f"test map {at}: {percentile}th percentile\nL2-V {errors}"
-        predictions: dict[str, Any] = {name: of_model[at] for name, of_model in images.items()}
+        predictions: dict[str, Any] = {
+            name.replace(", ", ",\n"): of_model[at] for name, of_model in images.items()
+        }
         mesh = shape.mesh
         rows.append(BodyRow(title, mesh.faces, mesh.vertices, test.positions[at], predictions))
     save_body_report(rows, path, limit=0.05)

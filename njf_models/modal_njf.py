@@ -134,7 +134,8 @@ class ModalNJF(WholeShapes, CodedModel):
             for phi in (maps, handles.rest, handles.harmonic)
         )
         rest, harmonic = handles.rest.float(), handles.harmonic.float()
-        return Basis(fields, maps, rest, harmonic, read, of_rest, of_harmonic, weights)
+        parts = (fields, maps, rest, harmonic, read, of_rest, of_harmonic, weights)
+        return Basis(*(part.contiguous() for part in parts))  # sums over them would copy them
 
     def _read_faces(self, mesh: dp.Mesh) -> tuple[Int[Tensor, "f"], Float[Tensor, "f"]]:
         if mesh.n_faces <= self.reads:
@@ -203,19 +204,23 @@ class ModalNJF(WholeShapes, CodedModel):
         Raises:
             ValueError: a shape without handles.
         """
-        return self.iterates(shape, code)[-1]
+        return self._maps(shape, code, only_last=True)[-1]
 
     def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
         """The maps after each round; arguments as for a call."""
+        return self._maps(shape, code, only_last=False)
+
+    def _maps(
+        self, shape: Shape, code: Float[Tensor, "*batch z"], *, only_last: bool
+    ) -> list[Prediction]:
         kept = self._kept is not None and self._kept[0] is shape
         basis = self._kept[1] if kept and self._kept is not None else self.basis(shape)
-        codes = code.reshape(-1, code.shape[-1])
-        batch = code.shape[:-1]
-        amounts = _handles(shape).amounts(codes)
-        start = basis.rest + _combined(amounts, basis.harmonic)
+        codes, batch = code.reshape(-1, code.shape[-1]), code.shape[:-1]
+        start = basis.rest + _combined(_handles(shape).amounts(codes), basis.harmonic)
         J = dp.jacobians(shape.mesh, start)
+        rounds = self.coefficients(shape, basis, codes)
         predictions = []
-        for h in self.coefficients(shape, basis, codes):
+        for h in rounds[-1:] if only_last else rounds:
             R, phi = J + _combined(h, basis.fields), start + _combined(h, basis.maps)
             R, phi = R.view(*batch, *R.shape[1:]), phi.view(*batch, *phi.shape[1:])
             predictions.append(Prediction(dp.extend(R, shape.frames), R, phi))

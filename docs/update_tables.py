@@ -543,11 +543,8 @@ def arap() -> str:
     summary, options, solver = (results[name] for name in ("summary", "options", "solver"))
     ours, theirs = summary["ours"], summary["global MLP"]
     maps = f"{ours['maps']:.0f} unseen positions of the handles"
-    pinned = [summary[f"{name}, pinned"] for name in ("ours", "global MLP")]
-    other = json.loads((RESULTS / "arap_field.json").read_text())
-    field = other["summary"]["the paper's field"]
-    head = ["untrained: identity", "ours", "global MLP", "global MLP / ours"]
-    head += ["ours, pinned", "global MLP, pinned", "the paper's field, trained longer"]
+    others = [name for name in summary if name not in ("untrained", "ours", "global MLP")]
+    head = ["untrained: identity", "ours", "global MLP", "global MLP / ours", *others]
     lines = [f"| {maps} | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
     for name in ours:
         if name not in ("maps", "CPU milliseconds, median"):  # of which there is a table below
@@ -557,16 +554,22 @@ def arap() -> str:
                 theirs[name],
                 theirs[name] / ours[name],
             ]
-            cells += [of_model[name] for of_model in (*pinned, field)]
+            cells += [summary[of_model][name] for of_model in others]
             lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
-    lines.append("| L2-V of the paper, on Raptor | – | 0.64 | 3.66 | 5.7 | – | – | 0.64 |")
+    spreads = [results["spread"][name]["L2-V"] for name in ("ours", "global MLP")]
+    cells = ["–", *map(number, spreads), "–"]
+    cells += [number(results["spread"][name]["L2-V"]) for name in others]
+    lines.append(f"| L2-V, largest less smallest of the seeds | {' | '.join(cells)} |")
+    rest = ["0.64" if name == "the paper's field" else "–" for name in others]
+    lines.append(f"| L2-V of the paper, on Raptor | – | 0.64 | 3.66 | 5.7 | {' | '.join(rest)} |")
     return "\n".join(
         [
             *lines,
             "",
-            f"Learned from {options['maps']:,} maps of {solver['tetrahedra']:,.0f} tetrahedra, one "
-            f"seed. {spent(results['training'] | other['training'])} The solver on the test maps: "
-            f"{solver['iterations, mean']:.0f} accelerated steps in the mean, residual at most "
+            f"Learned from {options['maps']:,} maps of {solver['tetrahedra']:,.0f} tetrahedra; "
+            f"means of {len(options['seeds'])} seeds. {spent(results['training'])} The solver on "
+            f"the test maps: {solver['iterations, mean']:.0f} accelerated steps in the mean, "
+            "residual at most "
             f"{solver['largest residual']:.1e} of the size, "
             f"{solver['flipped tetrahedra, mean']:.1f} flipped tetrahedra in the mean, "
             f"{solver['flipped tetrahedra, most']:.0f} at most.",
@@ -607,23 +610,25 @@ def contact() -> str:
         if name not in ("maps", "CPU milliseconds, median"):
             cells = [summary[of][name] for of in ("untrained", "ours", "offsets")]
             lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
+    spreads = [number(results["spread"][of]["L2-V"]) for of in ("ours", "offsets")]
+    lines.append(f"| L2-V, largest less smallest of the seeds | – | {' | '.join(spreads)} |")
     lines.append("| L2-V of the paper, on Romero et al.'s data | – | 0.398 | 0.424 |")
     return "\n".join(
         [
             *lines,
             "",
-            f"Learned from the states of {options['trajectories']} trajectories, one seed. "
-            f"{spent(results['training'])}",
+            f"Learned from the states of {options['trajectories']} trajectories; means of "
+            f"{len(options['seeds'])} seeds. {spent(results['training'])}",
         ]
     )
 
 
 def spent(costs: dict[str, dict]) -> str:
-    """Steps and CPU time of each model, as a sentence."""
-    parts = [
-        f"{name}: {cost['steps']:,} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
-        for name, cost in costs.items()
-    ]
+    """CPU time of each model, and its steps if they were planned, as a sentence."""
+    parts = []
+    for name, cost in costs.items():
+        steps = f"{cost['steps']:,.0f} steps, " if "steps" in cost else ""
+        parts.append(f"{name}: {steps}{cost['cpu seconds'] / 60:.1f} minutes of CPU time")
     sentence = "; ".join(parts)
     return f"{sentence[0].upper()}{sentence[1:]}."
 

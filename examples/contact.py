@@ -29,15 +29,29 @@ from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
 from njf_models.budget import planned_steps
-from njf_models.contact_maps import ContactRecord, block_shape, evaluate_contact, summarise
+from njf_models.contact_maps import (
+    ContactRecord,
+    block_handles,
+    block_shape,
+    evaluate_contact,
+    summarise,
+)
 from njf_models.datasets.contact import ContactMaps, ContactSettings, build_contact
 from njf_models.elastic_maps import ElasticBatches, elastic_loader
 from njf_models.evaluation import format_table
-from njf_models.experiments import circumstances, quiet, training_cost
+from njf_models.experiments import circumstances, mean, quiet, spread, training_cost
 from njf_models.features import Shape
-from njf_models.training import NJFTraining, last_checkpoint, load_checkpoint, make_trainer
+from njf_models.modal_training import KnownMaps, modal_in
+from njf_models.models import Model
+from njf_models.training import (
+    NJFTraining,
+    finished,
+    last_checkpoint,
+    load_checkpoint,
+    make_trainer,
+)
 
-KINDS = {"njf": "ours", "displacement": "offsets"}  # and names in tables
+KINDS = {"modal": "ours", "displacement": "offsets"}  # and names in tables
 SEEDS = {"train": 0, "validation": 1, "test": 2}
 N_VALIDATIONS = 10
 ERROR_LIMIT = 0.1  # where the colours of the error end; the block is 1 high
@@ -49,30 +63,35 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     quiet()
 
     maps = make_maps(options)
-    shape = block_shape(maps["test"].scene)
+    test = maps["test"]
+    free = block_shape(test.scene)
+    held = free.with_handles(block_handles(test.scene, free.mesh, test.settings.shift))
+    untrained = evaluate_contact(make_module(1, 0).model, test, free)[0]
+    runs = {"untrained": [summarise(untrained)]}
     records, costs = {}, {}
     images: dict[str, torch.Tensor] = {}
     for kind, title in KINDS.items():
-        steps = plan(kind, maps["train"], shape, options)
-        checkpoint = fit(kind, steps, maps, shape, options)
-        costs[title] = {"steps": steps, **training_cost(checkpoint)}
-        records[title], before, after = evaluate_contact(
-            load_checkpoint(checkpoint), maps["test"], shape
-        )
-        images |= {title: before, f"{title}, corrected": after}
+        shape = held if kind == "modal" else free
+        fits = [fit(kind, seed, maps, shape, options) for seed in options.seeds]
+        costs[title] = mean([cost for _, cost in fits])
+        for number, (model, _) in enumerate(fits):
+            found, before, after = evaluate_contact(model, test, shape)
+            runs.setdefault(title, []).append(summarise(found))
+            if number == 0:
+                records[title] = found
+                images |= {title: before, f"{title}, corrected": after}
 
-    untrained = evaluate_contact(make_module("njf", 1, options).model, maps["test"], shape)[0]
-    table = {"untrained": summarise(untrained)}
-    table |= {title: summarise(of_model) for title, of_model in records.items()}
+    table = {name: mean(rows) for name, rows in runs.items()}
     print("\nUnseen trajectories:\n" + format_table(table))
     results = {
         **circumstances(options),
         "training": costs,
-        "Newton steps of a state, mean": float(maps["test"].iterations.float().mean()),
+        "Newton steps of a state, mean": float(test.iterations.float().mean()),
         "summary": table,
+        "spread": {name: spread(rows) for name, rows in runs.items()},
     }
     (options.out / "results.json").write_text(json.dumps(results, indent=1))
-    draw(options.out / "results.png", maps["test"], images, records["ours"])
+    draw(options.out / "results.png", test, images, records["ours"])
     print(f"\n{options.out / 'results.png'}  {options.out / 'results.json'}")
     return table
 
@@ -88,7 +107,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--trajectories", type=int, default=300, metavar="N", help="to learn from (300)")
     add("--held-out", type=int, default=50, metavar="N", help="to validate, and to test (50)")
     add("--minutes", type=float, default=2.5, help="of CPU time for each model (2.5)")
-    add("--seed", type=int, default=0, help="of the weights and batches")
+    add("--rank", type=int, default=96, help="functions of our field (96)")
+    add("--rounds", type=int, default=1, help="predictions of our field (1)")
+    add("--seeds", type=int, nargs="+", default=[0], help="of weights and batches (0)")
     options = parser.parse_args(argv)
     options.data = options.data or options.out / "data"
     return options
@@ -106,39 +127,45 @@ def make_maps(options: argparse.Namespace) -> dict[str, ContactMaps]:
     }
 
 
-def batches(kind: str, maps: ContactMaps, shape: Shape) -> ElasticBatches:
-    """What a model learns from; the offsets' loss on Jacobians needs all neighbours of a vertex."""
-    if kind == "njf":
-        return ElasticBatches(maps, shape, n_targets=8, sampled=64, shuffle=True)
-    return ElasticBatches(maps, shape, n_targets=16, shuffle=True)
-
-
-def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraining:
-    lightning.seed_everything(options.seed, verbose=False)
+def make_module(steps: int, seed: int) -> NJFTraining:
+    lightning.seed_everything(seed, verbose=False)
     model = {"face_features": 6, "point_features": 0, "parameters": 10, "output_dim": 2}
-    return NJFTraining(model, steps=steps, kind=kind)
-
-
-def plan(kind: str, train: ContactMaps, shape: Shape, options: argparse.Namespace) -> int:
-    """Steps that take the wanted CPU time, a multiple of the validations: one follows the last."""
-    data, path = batches(kind, train, shape), options.out / f"{kind}-steps.json"
-    turns = [data[i] for i in range(data.period)]
-    return planned_steps(path, make_module(kind, 1, options), turns, options.minutes, N_VALIDATIONS)
+    return NJFTraining(model, steps=steps, kind="displacement")
 
 
 def fit(
-    kind: str, steps: int, maps: dict[str, ContactMaps], shape: Shape, options: argparse.Namespace
-) -> Path:
-    """Train, going on from the last checkpoint if there is one; the best by validation loss."""
-    folder = options.out / kind
-    trainer = make_trainer(folder, steps=steps, validate_every=steps // N_VALIDATIONS)
-    trainer.fit(
-        make_module(kind, steps, options),
-        elastic_loader(batches(kind, maps["train"], shape)),
-        elastic_loader(ElasticBatches(maps["validation"], shape, n_targets=50)),
-        ckpt_path=last_checkpoint(folder),
-    )
-    return folder / "checkpoints" / "best.ckpt"
+    kind: str, seed: int, maps: dict[str, ContactMaps], shape: Shape, options: argparse.Namespace
+) -> tuple[Model, dict[str, float]]:
+    """Train for the wanted CPU time, or load what is trained: the model, and its cost.
+
+    Offsets take as many steps as that time has room for, a multiple of the validations, and are the
+    best of those. Their loss on Jacobians needs all neighbours of a vertex.
+    """
+    folder = options.out / f"{kind}-{seed}"
+    if kind == "modal":
+        known = {name: KnownMaps(x.parameters, x.positions) for name, x in maps.items()}
+        sizes = {"rank": options.rank, "rounds": options.rounds, "output_dim": 2}
+        return modal_in(
+            folder,
+            {"parameters": 10, "amounts": 8, **sizes},
+            shape,
+            known["train"],
+            known["validation"],
+            minutes=options.minutes,
+            seed=seed,
+        )
+    data = ElasticBatches(maps["train"], shape, n_targets=16, shuffle=True)
+    path = options.out / f"{kind}-steps.json"
+    steps = planned_steps(path, make_module(1, seed), [data[0]], options.minutes, N_VALIDATIONS)
+    if not finished(folder, steps):
+        make_trainer(folder, steps=steps, validate_every=steps // N_VALIDATIONS).fit(
+            make_module(steps, seed),
+            elastic_loader(data),
+            elastic_loader(ElasticBatches(maps["validation"], shape, n_targets=50)),
+            ckpt_path=last_checkpoint(folder),
+        )
+    best = folder / "checkpoints" / "best.ckpt"
+    return load_checkpoint(best), {"steps": float(steps), **training_cost(best)}
 
 
 def draw(

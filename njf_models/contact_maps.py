@@ -15,6 +15,7 @@ from torch import Tensor
 import diffpoisson as dp
 from njf_models.datasets.contact import ContactMaps, ContactSolver, Scene
 from njf_models.features import Shape
+from njf_models.handles import Handles
 from njf_models.metrics import l2_jacobians, l2_vertices
 from njf_models.models import Model
 
@@ -26,6 +27,33 @@ def block_shape(scene: Scene) -> Shape:
     """The block prepared for the networks: in the plane z = 0 of space."""
     flat = np.concatenate([scene.vertices, np.zeros((len(scene.vertices), 1))], axis=1)
     return Shape.prepare(dp.Mesh(flat, scene.faces))
+
+
+def block_handles(scene: Scene, mesh: dp.Mesh, shift: float) -> Handles:
+    """The ends of the block as pins, told by `ContactMaps.parameters`.
+
+    An end at x + t + Rx, R a turn by an angle about its middle: linear in t, cos - 1 and sin.
+
+    Args:
+        scene: the block.
+        mesh: of `block_shape`.
+        shift: of `ContactSettings`.
+    """
+    held = scene.handle_of >= 0
+    at, of = scene.vertices[held], scene.handle_of[held]
+    moves = np.zeros((2, 4, len(at), 2))
+    for k in range(2):
+        arm = at[of == k] - at[of == k].mean(axis=0)
+        ones, zeros = np.ones(len(arm)), np.zeros(len(arm))
+        rows = [(ones, zeros), (zeros, ones), arm.T, (-arm[:, 1], arm[:, 0])]
+        moves[k, :, of == k] = np.array(rows).transpose(2, 0, 1)
+
+    def amounts(code: Tensor) -> Tensor:
+        x, y, angle = (shift * code[..., :6].double()).unflatten(-1, (2, 3)).unbind(-1)
+        return torch.stack([x, y, angle.cos() - 1, angle.sin()], dim=-1).flatten(-2)
+
+    pins, origin = torch.from_numpy(held), torch.from_numpy(at)
+    return Handles(mesh, pins, origin, torch.from_numpy(moves.reshape(8, -1, 2)), amounts)
 
 
 @dataclass(frozen=True)

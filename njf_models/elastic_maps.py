@@ -16,7 +16,9 @@ from torch.utils.data import DataLoader, Dataset
 import diffpoisson as dp
 from njf_models.datasets.arap import ArapMaps
 from njf_models.datasets.contact import ContactMaps
+from njf_models.datasets.solids import Solid
 from njf_models.features import Shape
+from njf_models.handles import Handles
 from njf_models.map_errors import MapErrors, map_errors
 from njf_models.map_errors import summarise as summarise_errors
 from njf_models.models import Model
@@ -113,6 +115,21 @@ class _Sample:
 def elastic_loader(batches: ElasticBatches) -> DataLoader[Batch]:
     """The batches as they are. Factors live in this process, so there are no workers."""
     return DataLoader(batches, batch_size=None, shuffle=batches.shuffle)
+
+
+def solid_handles(solid: Solid, mesh: dp.Mesh, reach: float) -> Handles:
+    """The handles of a solid as pins of maps of its surface, told by `ArapMaps.parameters`.
+
+    Args:
+        solid: which is deformed.
+        mesh: its surface.
+        reach: of `ArapSettings`.
+    """
+    of = torch.from_numpy(solid.handle_of[solid.surface])
+    held = of >= 0
+    each = torch.eye(solid.n_handles, dtype=torch.float64)[of[held]]  # (p, h)
+    moves = reach * torch.einsum("ph,cd->hcpd", each, torch.eye(3, dtype=torch.float64))
+    return Handles(mesh, held, mesh.vertices[held].double(), moves.flatten(0, 1))
 
 
 # -------------------------------------------------------------------- evaluation

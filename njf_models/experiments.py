@@ -6,9 +6,11 @@ import argparse
 import logging
 import platform
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 
@@ -33,3 +35,13 @@ def training_cost(checkpoint: Path) -> dict[str, float | None]:
     """Seconds of the training whose last checkpoint lies beside this one, until its last step."""
     last = torch.load(checkpoint.with_name("last.ckpt"), weights_only=False)
     return {"cpu seconds": last["cpu_seconds"], "seconds": last["training_seconds"]}
+
+
+def mean(rows: Sequence[Mapping[str, float | int]]) -> dict[str, float]:
+    """The mean of each column."""
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def spread(rows: Sequence[Mapping[str, float | int]]) -> dict[str, float]:
+    """The largest minus the smallest value of each column, over seeds."""
+    return {name: float(np.ptp([row[name] for row in rows])) for name in rows[0]}

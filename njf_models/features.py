@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import diffpoisson as dp
+from njf_models.handles import Handles
 from njf_models.spectrum import Spectrum
 
 
@@ -149,6 +150,7 @@ class Shape:
             operators are intrinsic and know no pose.
         vertex_features: (n, v) features of the vertices, for models of maps by their values.
         spectra: of each part, for models that diffuse; none if not asked for.
+        handles: of a single mesh: what its maps are pinned to, if a code says where that is.
     """
 
     mesh: dp.Mesh
@@ -157,6 +159,7 @@ class Shape:
     frames: Float[Tensor, "m 3 2"]
     vertex_features: Float[Tensor, "n v"]
     spectra: tuple[Spectrum, ...] = ()
+    handles: Handles | None = None
 
     @classmethod
     def prepare(
@@ -212,6 +215,10 @@ class Shape:
             frames=turns[parts] @ self.frames,
             vertex_features=_moved_features(self.vertex_features, turns[owners], scales[owners]),
         )
+
+    def with_handles(self, handles: Handles) -> Shape:
+        """The same shape, whose maps are pinned."""
+        return replace(self, handles=handles)
 
     def with_features(self, features: Float[Tensor, "m f"]) -> Shape:
         """The same operators under other features."""

@@ -39,12 +39,13 @@ def paper_loss(
 
     Args:
         shape: the source(s).
-        prediction: what the network made of them.
+        prediction: what the network made of them; a pinned map, in any position.
         target: (…, n, c) Ψ, the images of the vertices, in any position.
         reduction: "mean" over the shapes, or "none" for the loss of each.
     """
     mesh = shape.mesh
-    difference = prediction.vertices - centre_areas(shape, target)
+    phi = prediction.vertices if shape.handles is None else centre_areas(shape, prediction.vertices)
+    difference = phi - centre_areas(shape, target)
     vertices = shape.vertex_weights.to(difference.dtype) * difference.square().sum(-1)
     difference = prediction.jacobians - dp.jacobians(mesh, target)
     jacobians = shape.face_weights.to(difference.dtype) * difference.square().sum((-2, -1))

@@ -7,6 +7,7 @@ from njf_models.baselines.diffusion import DiffusionMap
 from njf_models.baselines.displacement import DisplacementField
 from njf_models.baselines.global_mlp import GlobalMLP
 from njf_models.diffusion_njf import DiffusionEncodedNJF
+from njf_models.modal_njf import ModalNJF
 from njf_models.njf import NeuralJacobianField
 
 Model = (
@@ -16,6 +17,7 @@ Model = (
     | GlobalMLP
     | DiffusionMap
     | DiffusionEncodedNJF
+    | ModalNJF
 )
 MODELS: dict[str, type[Model]] = {
     "njf": NeuralJacobianField,
@@ -24,4 +26,5 @@ MODELS: dict[str, type[Model]] = {
     "global": GlobalMLP,
     "diffusion": DiffusionMap,
     "diffusion+njf": DiffusionEncodedNJF,
+    "modal": ModalNJF,
 }

@@ -470,6 +470,12 @@ def last_checkpoint(folder: Path) -> Path | None:
     return path if path.exists() else None
 
 
+def finished(folder: Path, steps: int) -> bool:
+    """Whether a training in a folder of `make_trainer` has taken so many steps."""
+    path = last_checkpoint(folder)
+    return path is not None and torch.load(path, weights_only=False)["global_step"] >= steps
+
+
 def load_checkpoint(path: Path) -> Model:
     """The network in a checkpoint of `NJFTraining`, ready for inference."""
     return NJFTraining.load_from_checkpoint(path, map_location="cpu").model.eval()

@@ -17,6 +17,8 @@ from njf_models.sampled import WholeShapes
 class GlobalMLP(WholeShapes, CodedModel):
     """Code ↦ all m matrices R, then the Poisson solve: the paper's baseline for one fixed mesh.
 
+    Of a shape with handles the solve is pinned to them, where the code says they are.
+
     Four hidden layers with the norms and activations of `FieldMLP`; the last starts at the
     identity map.
 
@@ -59,7 +61,7 @@ class GlobalMLP(WholeShapes, CodedModel):
         rows = self.layers(code.reshape(-1, self.code_size))
         offsets = rows.view(*code.shape[:-1], self.n_faces, self.output_dim, 2)
         R = shape.frames[:, : self.output_dim] + offsets.to(shape.frames.dtype)
-        phi = shape.solver(R)
+        phi = shape.solver(R) if shape.handles is None else shape.handles.solved(R, code)
         if self.centering == "vertex":
             phi = centre_vertices(shape, phi)
         return Prediction(dp.extend(R, shape.frames), R, phi)

@@ -4,6 +4,7 @@
 `docs/results/arap_speed.json`. Each level cuts every tetrahedron of the one before into eight, and
 so each face of the surface into four; the network, trained on the first, maps the others as it is;
 what of it depends on the mesh alone is prepared, as the factor is.
+Its functions are prepared by as many Poisson solves; a map is then a sum of them.
 Times are of one processor. The solver ends where a step moves no vertex by more than a millionth of
 the size. "As it comes" it is libigl's; accelerated it is what made the data.
 """
@@ -22,19 +23,21 @@ import torch
 import diffpoisson as dp
 from njf_models.datasets.arap import ArapSettings, ArapSolver, draw_offsets, load_solid
 from njf_models.datasets.solids import Solid
+from njf_models.elastic_maps import solid_handles
 from njf_models.features import Shape
 from njf_models.metrics import l2_normals, l2_vertices
-from njf_models.njf import NeuralJacobianField
-from njf_models.training import load_checkpoint
+from njf_models.modal_njf import ModalNJF
+from njf_models.modal_training import load_modal
 
 RESULT = Path(__file__).parents[2] / "docs" / "results" / "arap_speed.json"
 TEST = ArapSettings(seed=2)  # as in the example
 
 
-def measure(solid: Solid, model: NeuralJacobianField, n_maps: int) -> dict[str, Any]:
+def measure(solid: Solid, model: ModalNJF, n_maps: int) -> dict[str, Any]:
     """Seconds and errors on one mesh: median over some test maps."""
     start = time.process_time()
     shape = Shape.prepare(dp.Mesh(solid.vertices[solid.surface], solid.faces))
+    shape = shape.with_handles(solid_handles(solid, shape.mesh, TEST.reach))
     model = model.on(shape)  # what depends on the mesh alone
     prepared = time.process_time() - start
     rows = [_measure_map(solid, shape, model, number) for number in range(n_maps)]
@@ -51,9 +54,7 @@ def measure(solid: Solid, model: NeuralJacobianField, n_maps: int) -> dict[str, 
 
 
 @torch.no_grad()
-def _measure_map(
-    solid: Solid, shape: Shape, model: NeuralJacobianField, number: int
-) -> dict[str, float]:
+def _measure_map(solid: Solid, shape: Shape, model: ModalNJF, number: int) -> dict[str, float]:
     offsets = draw_offsets(TEST, number, solid.n_handles)
     row: dict[str, float] = {}
     for name, memory in (("solver", 0), ("accelerated", 6)):
@@ -83,11 +84,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder with the solid (RUN/data)")
     parser.add_argument("--levels", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--maps", type=int, default=5, help="on the coarsest; then fewer")
+    parser.add_argument("--rounds", type=int, default=5, help="predictions of our field (5)")
     parser.add_argument("--out", type=Path, default=RESULT)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    model = load_checkpoint(options.run / "njf" / "checkpoints" / "best.ckpt")
-    assert isinstance(model, NeuralJacobianField)
+    model = load_modal(options.run / "modal-0" / "model.pt")[0].with_rounds(options.rounds)
     solid = load_solid((options.data or options.run / "data") / "solid.safetensors")
     results = {}
     for level in range(max(options.levels) + 1):

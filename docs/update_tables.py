@@ -732,7 +732,15 @@ PAPER = [
 def paper() -> str:
     """All rows of the paper's Tables 1 and 2 beside what there is here."""
     head = ["experiment", "quantity", "paper: ours", "baseline", "ratio"]
-    head += ["here: ours", "baseline", "ratio", "CPU minutes", "baseline is", "data here"]
+    head += [
+        "here: ours",
+        "baseline",
+        "ratio",
+        "CPU minutes",
+        "seed spread",
+        "baseline is",
+        "data here",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for row in PAPER:
         cells = [row.experiment, row.quantity, *ratio(row.ours, row.theirs), *counterpart(row)]
@@ -748,15 +756,15 @@ def ratio(ours: float, theirs: float | None) -> list[str]:
 
 
 def counterpart(row: Row) -> list[str]:
-    """The same of our result."""
+    """The same of our result, its training and the spread of its seeds."""
     path = RESULTS / f"{row.result}.json"
     if row.result is None or not path.exists():
-        return ["not yet", "not yet" if row.baseline else "–", "–", "–"]
+        return ["not yet", "not yet" if row.baseline else "–", "–", "–", "–"]
     results = json.loads(path.read_text())
     summary = results.get("summary") or results.get("raw") or results["models"]
     ours, theirs = row.columns
     if ours not in summary:
-        return ["not yet", "not yet", "–", "–"]
+        return ["not yet", "not yet", "–", "–", "–"]
     cells = ratio(summary[ours][row.quantity], None)
     if theirs in summary:
         cells = ratio(summary[ours][row.quantity], summary[theirs][row.quantity])
@@ -765,7 +773,8 @@ def counterpart(row: Row) -> list[str]:
     cost = results.get("training", {}).get(ours, {})
     seconds = cost.get("cpu seconds", 0) + cost.get("earlier, cpu seconds", 0)
     minutes = seconds / 60 if seconds else results.get("minutes")
-    return [*cells, "–" if minutes is None else number(minutes)]
+    spread = results.get("spread", {}).get(ours, {}).get(row.quantity)
+    return [*cells, *("–" if value is None else number(value) for value in (minutes, spread))]
 
 
 def data_cost() -> str:

@@ -26,7 +26,7 @@ from njf_models.modal_njf import Basis, ModalNJF
 
 SHARES = (0.2, 0.3, 0.5)  # of the time: functions, first guess, corrections, if there are any
 _BATCH = 128
-_NOISE = 1.5
+_NOISE = 1.5  # corrections learn from errors of up to so many times those of the first guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +253,10 @@ def _orthonormal(
     basis = model.basis(shape)
     rows = weights.rows(basis.maps, basis.fields).double()
     eigenvalues, vectors = torch.linalg.eigh(rows @ rows.T)
-    change = vectors.T / eigenvalues.clamp_min(1e-6 * float(eigenvalues[-1])).sqrt()[:, None]
+    # Functions are rounded to single precision, so their products are known to 2 ε of their trace.
+    # Below that a combination of them is nothing but rounding: not to be blown up to length one.
+    known = 2 * torch.finfo(torch.float32).eps * eigenvalues.sum()
+    change = vectors.T / eigenvalues.clamp_min(known).sqrt()[:, None]
     best = _best(basis, weights, shape, missing, change)
     *_, V = torch.linalg.svd(best - best.mean(0), full_matrices=False)
     change = V @ change

@@ -1,8 +1,10 @@
-"""Maps between human bodies: a Neural Jacobian Field beside baselines, on four tasks.
+"""Maps between human bodies: a Neural Jacobian Field beside baselines, on five tasks.
 
-`--task repose`: from the rest pose to pose parameters; `any-pose`: from any pose to pose
-parameters; `registration`: a body with pieces cut away onto points of the same body in another
-pose; `morphing`: a body in any pose onto points of another body in any pose.
+`--task repose`: from the rest pose to pose parameters; `unpose`: from any pose to rest; `any-pose`:
+from any pose to pose parameters; `registration`: a body with pieces cut away onto points of the
+same body in another pose; `morphing`: a body in any pose onto points of another body in any pose.
+With `--after RUN ...` the maps are a chain: they start from where the networks of other folders,
+trained to unpose, take the bodies.
 
 Random bodies → poses inside joint limits → training → evaluation on bodies and poses that were
 never seen. Training has two phases, one optimizer and one schedule: first on random faces of
@@ -29,7 +31,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import lightning
 import numpy as np
@@ -39,15 +41,16 @@ from torch.utils.data import DataLoader
 from njf_models.baselines.cages import CageDeformation
 from njf_models.body_maps import (
     TASKS,
-    BodyCells,
     BodyMaps,
+    CellSampler,
     MapRecord,
     body_loader,
     cell_loader,
     evaluate_maps,
-    pair_loader,
 )
 from njf_models.body_report import BodyRow, save_body_report
+from njf_models.carried import carry
+from njf_models.chain import ChainedNJF
 from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
 from njf_models.evaluation import format_table
 from njf_models.experiments import circumstances, quiet, training_cost
@@ -61,9 +64,38 @@ from njf_models.training import (
     load_checkpoint,
 )
 
-KINDS = {"njf": "ours", "displacement": "displacement", "cages": "cages"}  # and names in tables
+KINDS = {  # and names in tables
+    "njf": "ours",
+    "displacement": "displacement",
+    "cages": "cages",
+    "displacement-parts": "displacement, our field",
+}
 PAPER = {"bodies": 2000, "poses": 32, "code_size": 1000, "points": 1024, "targets": 32}
-LEARNING_RATE = 2e-3
+CODE_SCALE = 0.1  # of encoders: without it, a network is slow to see that bodies differ in pose
+
+
+class Recipe(NamedTuple):
+    """How a model is trained, if the command line does not say otherwise.
+
+    Attributes:
+        per_step: bodies per sampled step.
+        targets: of each per step.
+        cells: sampled of each.
+        learning_rate: at its height.
+        arguments: of the model.
+    """
+
+    per_step: int
+    targets: int
+    cells: int
+    learning_rate: float
+    arguments: dict[str, int] = {}  # noqa: RUF012
+
+
+IN_PARTS = Recipe(16, 24, 64, 3e-3, {"parts": 128, "width": 256})
+OF_EACH_FACE = Recipe(8, 8, 100, 2e-3)
+ONE_TARGET = Recipe(32, 1, 128, 2e-3)
+WARMUP = 300  # steps; with many parts, a start at the full rate ends in none being used
 
 
 def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
@@ -72,15 +104,21 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     quiet()
 
     train, validation, test = make_bodies(options)
+    if options.after:
+        train, validation = (
+            carried(bodies, options, name)
+            for bodies, name in ((train, "train"), (validation, "validation"))
+        )
     steps = plan(train, options)
     records, maps, costs = {}, {}, {}
     for kind in options.models:
         title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
         costs[title] = {"steps": steps[kind], **cost(checkpoint), **earlier(title, options.init)}
-        records[title], maps[title] = evaluate_maps(
-            load_checkpoint(checkpoint), maps_of(test, options)
-        )
+        network = load_checkpoint(checkpoint)
+        if options.after:
+            network = ChainedNJF.of([*earlier_networks(options), network], options.points)
+        records[title], maps[title] = evaluate_maps(network, maps_of(test, options))
 
     table = {"untrained": summarise(unmoved(options, test))}
     table |= {title: summarise(of_model) for title, of_model in records.items()}
@@ -111,18 +149,20 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--held-out", type=int, default=16, metavar="N", help="test identities (16)")
     add("--faces", type=int, default=2500, help="of the triangulation (2500)")
     add("--sources", type=int, metavar="N", help="poses of a body that are sources (the task's)")
-    add("--targets", type=int, default=8, metavar="N", help="of a source per step (8)")
+    add("--targets", type=int, metavar="N", help="of a source per step (the model's)")
     add("--steps", type=int, default=3000, help="of the Neural Jacobian Field (3000)")
     add(
         "--whole", type=float, default=0.13, metavar="X", help="share of whole bodies' steps (0.13)"
     )
-    add("--per-step", type=int, default=8, metavar="N", help="bodies per sampled step (8)")
-    add("--cells", type=int, default=100, metavar="N", help="sampled of each (100)")
-    add("--code-size", type=int, default=256, help="of PointNet's code (256)")
+    add("--per-step", type=int, metavar="N", help="bodies per sampled step (the model's)")
+    add("--cells", type=int, metavar="N", help="sampled of each (the model's)")
+    add("--code-size", type=int, default=128, help="of PointNet's code (128)")
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
-    add("--models", nargs="+", choices=KINDS, default=list(KINDS), help="which to train (all)")
+    add("--models", nargs="+", choices=KINDS, help="which to train (ours, displacement, cages)")
     add("--validations", type=int, default=10, metavar="N", help="in a training (10)")
+    add("--after", type=Path, nargs="+", default=[], metavar="RUN", help="start where these lead")
+    add("--carried", type=int, default=8, metavar="N", help="of a body's poses, for that (8)")
     add("--init", type=Path, metavar="RUN", help="begin with the networks of another folder")
     add("--full", action="store_true", help=f"the paper's scale: {PAPER}, 200,000 steps")
     add("--seed", type=int, default=0)
@@ -131,6 +171,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         parser.set_defaults(**PAPER, steps=200_000)
         options = parser.parse_args(argv)
     options.out = options.out or Path("runs") / options.task
+    options.models = options.models or ["njf", "displacement", "cages"]
     options.data = options.data or options.out / "bodies"
     return options
 
@@ -155,32 +196,55 @@ def inputs(options: argparse.Namespace) -> dict[str, int]:
 
 
 def maps_of(
-    bodies: BodyStore | list[Body], options: argparse.Namespace, *, training: bool = False
+    bodies: BodyStore | list[Body],
+    options: argparse.Namespace,
+    *,
+    kind: str = "njf",
+    training: bool = False,
 ) -> BodyMaps:
     """Maps to learn or to evaluate."""
     task = TASKS[options.task]
     if options.sources is not None:
         task = replace(task, sources=options.sources)
     if training and task.sources:
-        task = replace(task, sources=options.poses)  # all of them
-    n_targets = options.targets if training else options.poses
+        n_sources = options.carried if options.after else options.poses  # all that there are
+        task = replace(task, sources=n_sources)
+    n_targets = recipe(kind, options).targets if training else options.poses
     return BodyMaps(bodies, task, n_targets=n_targets, resample=training, **inputs(options))
+
+
+def recipe(kind: str, options: argparse.Namespace) -> Recipe:
+    """How a model is trained on a task, with what the command line says."""
+    if TASKS[options.task].told == "nothing":
+        chosen = ONE_TARGET  # what parts save, they save over the targets of a source
+    else:
+        chosen = IN_PARTS if kind in ("njf", "displacement-parts") else OF_EACH_FACE
+    said = {name: getattr(options, name) for name in ("per_step", "targets", "cells")}
+    return chosen._replace(**{name: n for name, n in said.items() if n is not None})
 
 
 def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraining:
     lightning.seed_everything(options.seed, verbose=False)
-    n_features = 6 + options.energies
-    model = {
+    n_features, how = 6 + options.energies, recipe(kind, options)
+    model: dict[str, Any] = {
         "face_features": n_features,
         "point_features": n_features,
         "code_size": options.code_size,
+        "code_scale": CODE_SCALE,
+        **how.arguments,
     }
-    if TASKS[options.task].told == "pose":
-        model["parameters"] = POSE_SIZE
-    else:
+    told = TASKS[options.task].told
+    if told == "pose":
+        model |= {"parameters": POSE_SIZE, "rotations": True}
+    elif told == "points":
         model["encodes_target"] = True
     return NJFTraining(
-        model, learning_rate=LEARNING_RATE, steps=steps, inputs=inputs(options), kind=kind
+        model,
+        learning_rate=how.learning_rate,
+        steps=steps,
+        warmup=WARMUP,
+        inputs=inputs(options),
+        kind=kind.removesuffix("-parts"),
     )
 
 
@@ -188,16 +252,31 @@ def loaders(
     kind: str, train: BodyStore | list[Body], options: argparse.Namespace
 ) -> dict[str, DataLoader[Any]]:
     """What each phase of a training sees."""
-    maps = maps_of(train, options, training=True)
+    maps, how = maps_of(train, options, kind=kind, training=True), recipe(kind, options)
     phases: dict[str, DataLoader[Any]] = {}
-    samples = MODELS[kind].samples
-    if samples is not None and maps.task.others:
-        phases["sampled"] = pair_loader(
-            maps, samples, options.cells, options.per_step, options.targets
-        )
-    elif samples is not None:
-        phases["sampled"] = cell_loader(BodyCells(maps, samples, options.cells), options.per_step)
-    return phases | {"whole": body_loader(maps, shuffle=True)}
+    samples = MODELS[kind.removesuffix("-parts")].samples
+    if samples is not None:
+        phases["sampled"] = cell_loader(CellSampler(maps, samples, how.cells), how.per_step)
+    if samples is None or options.whole > 0:
+        phases["whole"] = body_loader(maps, shuffle=True)
+    return phases
+
+
+def carried(bodies: BodyStore, options: argparse.Namespace, name: str) -> list[Body]:
+    """Bodies and where the networks of `--after` take them."""
+    n_sources = options.carried if name == "train" else TASKS[options.task].sources
+    return carry(
+        bodies,
+        earlier_networks(options),
+        options.out / "carried" / name,
+        n_sources=n_sources if options.sources is None or name == "train" else options.sources,
+        n_points=options.points,
+    )
+
+
+def earlier_networks(options: argparse.Namespace) -> list[Any]:
+    """The networks of `--after`, which end where this one's maps start."""
+    return [load_checkpoint(run / "njf" / "checkpoints" / "best.ckpt") for run in options.after]
 
 
 def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, dict[str, int]]:
@@ -206,19 +285,18 @@ def plan(train: BodyStore, options: argparse.Namespace) -> dict[str, dict[str, i
     The time of a phase that a model does without is added to the other.
     """
     path = options.out / "steps.json"
-    steps = json.loads(path.read_text()) if path.exists() else {}
+    steps: dict[str, dict[str, int]] = json.loads(path.read_text()) if path.exists() else {}
     if missing := [kind for kind in options.models if kind not in steps]:
         shares = {"sampled": 1 - options.whole, "whole": options.whole}
         ours = seconds_per_step("njf", train, options)
-        seconds = {phase: options.steps * share * ours[phase] for phase, share in shares.items()}
+        seconds = {phase: options.steps * shares[phase] * ours[phase] for phase in ours}
         for kind in missing:
             each = ours if kind == "njf" else seconds_per_step(kind, train, options)
             left = sum(seconds[phase] for phase in seconds if phase not in each)
             n = {phase: round(seconds[phase] / second) for phase, second in each.items()}
-            n["whole"] += round(left / each["whole"])
-            n["whole"] += (
-                -sum(n.values()) % options.validations
-            )  # so that one follows the last step
+            last = list(n)[-1]
+            n[last] += round(left / each[last])
+            n[last] += -sum(n.values()) % options.validations  # so that one follows the last step
             steps[kind] = n
         path.write_text(json.dumps(steps))
     return steps
@@ -231,10 +309,10 @@ def seconds_per_step(kind: str, train: BodyStore, options: argparse.Namespace) -
     """
     module = make_module(kind, 1, options)
     optimizer = torch.optim.Adam(module.parameters())
-    few = [train[i] for i in range(min(len(train), options.per_step))]
+    few = [train[i] for i in range(min(len(train), recipe(kind, options).per_step))]
     seconds = {}
     for phase, loader in loaders(kind, few, options).items():
-        for batch in islice(loader, options.per_step):
+        for batch in islice(loader, len(few)):
             module.training_step(batch, 0)
         times = []
         batches: Iterator[Any] = repeated(loader)
@@ -267,7 +345,7 @@ def fit(
         other = load_checkpoint(options.init / kind / "checkpoints" / "best.ckpt")
         module.model.load_state_dict(other.state_dict())
     ends = dict(zip(steps, np.cumsum(list(steps.values())).tolist(), strict=True))
-    total = ends["whole"]
+    total = max(ends.values())
     data = loaders(kind, train, options)
     if isinstance(module.model, CageDeformation) and steps_done(options.out / kind) < total:
         make_cages(module.model, data["whole"].dataset, options.out / kind / "cages.json")

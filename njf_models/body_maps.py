@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -15,10 +15,11 @@ from torch.utils.data import DataLoader, Dataset
 import diffpoisson as dp
 from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.datasets.partial import Partial, cut_pieces
+from njf_models.datasets.poses import reflected
 from njf_models.features import Shape, point_features
 from njf_models.map_errors import MapErrors, map_errors
 from njf_models.models import Model
-from njf_models.sampled import CellKind, Cells
+from njf_models.sampled import CellKind, Cells, Surfaces
 from njf_models.training import Batch, encoded
 
 _KEPT_SOURCES = 512  # each half a megabyte, and some of them with a factor
@@ -30,14 +31,15 @@ class Task:
 
     Attributes:
         sources: how many poses of each body are sources, the first ones; 0 for the rest pose.
-        told: the target's pose parameters, or points on its surface.
+        told: the target's pose parameters, or points on its surface; or nothing, and the target is
+            the rest pose.
         others: whether targets are poses of other bodies, not of the source's own.
         pieces: how many pieces are cut away from a source.
         radii: least and largest radius of a piece, in metres.
     """
 
     sources: int = 0
-    told: Literal["pose", "points"] = "pose"
+    told: Literal["pose", "points", "nothing"] = "pose"
     others: bool = False
     pieces: int = 0
     radii: tuple[float, float] = (0.08, 0.2)
@@ -45,12 +47,14 @@ class Task:
 
 TASKS = {
     "repose": Task(),
+    "unpose": Task(sources=2, told="nothing"),
     "any-pose": Task(sources=2),
     "registration": Task(sources=2, told="points", pieces=3),
     "morphing": Task(sources=2, told="points", others=True),
 }
-"""The paper's experiments: from rest to pose parameters; from any pose to pose parameters; a body
-with pieces cut away onto points of itself in another pose; a body onto points of another one."""
+"""From rest to pose parameters; from any pose to rest; from any pose to pose parameters; a body
+with pieces cut away onto points of itself in another pose; a body onto points of another one. All
+but the second are the paper's experiments."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +66,7 @@ class Source:
         pose: number of its pose; None for the rest pose.
         mesh: its surface, or what is left of it.
         kept: (n,) which vertices of the body its vertices are.
+        faces: (m,) which faces of the body its faces are.
         wks: its wave-kernel signature, if the network sees one.
     """
 
@@ -69,6 +74,7 @@ class Source:
     pose: int | None
     mesh: dp.Mesh
     kept: Int[Tensor, "n"]
+    faces: Int[Tensor, "m"]
     wks: Float[Tensor, "n k"] | None
 
     @cached_property
@@ -128,8 +134,10 @@ class BodyMaps(Dataset[Batch]):
         return self._make_source(index) if anew else self._kept_source(index)
 
     def targets(self, index: int) -> Int[Tensor, "t 2"]:
-        """Body and pose of the targets of a source; others at each call if resampled."""
+        """Body and pose of the targets of a source, -1 for rest; others each time if resampled."""
         own, n_poses = index // max(1, self.task.sources), self._n_poses
+        if self.task.told == "nothing":
+            return torch.tensor([[own, -1]])
         if self.task.others:
             generator, n = self._generator(index), min(self.n_targets, n_poses)
             # Any body but the source's own.
@@ -148,31 +156,56 @@ class BodyMaps(Dataset[Batch]):
         points = self._points(source.mesh, source.wks, index)[None]
         return Batch(source.shape, points, vertices, targets.parameters, targets.points)
 
-    def cells(self, index: int, kind: CellKind, n_cells: int) -> Cells:
-        """Random cells of a source; nothing is factorised."""
-        source, targets = self.source(index), self._targets(index)
-        return Cells.draw(
-            kind,
-            n_cells,
-            source.mesh,
-            source.wks,
-            targets.vertices[:, source.kept],
-            points=self._points(source.mesh, source.wks, index),
-            parameters=targets.parameters,
-            target_points=targets.points,
-        )
+    def surfaces(self, indices: Sequence[int]) -> Surfaces:
+        """Several sources, to draw cells from; nothing is factorised."""
+        if not (self.task.pieces or self.n_energies):
+            vertices = torch.stack([self._vertices(index) for index in indices])
+            return Surfaces(vertices, self._body(0).faces)
+        return self._partial_surfaces(indices)
 
-    def posed_points(self, index: int) -> PosedPoints:
-        """A source, and the points that the encoder sees of it."""
-        source = self.source(index)
-        return PosedPoints(source, self._points(source.mesh, source.wks, index))
+    def _partial_surfaces(self, indices: Sequence[int]) -> Surfaces:
+        """Sources that have lost pieces, or have a signature: by way of their meshes."""
+        sources = [self.source(index) for index in indices]
+        vertices = torch.stack([self._vertices(index) for index in indices])
+        faces = self._body(0).faces
+        present = torch.zeros(len(sources), len(faces))
+        for row, source in zip(present, sources, strict=True):
+            row[source.faces] = 1
+        wks = None
+        if self.n_energies:
+            wks = torch.zeros(*vertices.shape[:2], self.n_energies)
+            for rows, source in zip(wks, sources, strict=True):
+                assert source.wks is not None
+                rows[source.kept] = source.wks.float()
+        return Surfaces(vertices, faces, present, wks)
+
+    def any_targets(self, n_targets: int) -> Float[Tensor, "1 t n 3"]:
+        """Bodies in poses, drawn at random, as targets of any sources."""
+        bodies = torch.randint(len(self.bodies), (n_targets,)).tolist()
+        poses = torch.randint(self._n_poses, (n_targets,)).tolist()
+        pairs = zip(bodies, poses, strict=True)
+        return torch.stack([self._body(body).posed[pose] for body, pose in pairs])[None]
+
+    def own_targets(self, index: int) -> tuple[Float[Tensor, "t n 3"], Float[Tensor, "t p"]]:
+        """Vertices of the targets of a source that are its own body, and their pose parameters."""
+        poses, body = self.targets(index)[:, 1], self._body(index // max(1, self.task.sources))
+        if self.task.told == "nothing":
+            return body.rest[None], torch.zeros(1, 0)
+        return body.posed[poses], body.poses[poses]
+
+    def _vertices(self, index: int) -> Float[Tensor, "n 3"]:
+        """Of the whole body that is a source, where networks took it to if they did."""
+        body = self._body(index // max(1, self.task.sources))
+        if not self.task.sources:
+            return body.rest
+        poses = body.posed if body.carried is None else body.carried
+        return poses[index % self.task.sources]
 
     def _make_source(self, index: int) -> Source:
         body = self._body(index // max(1, self.task.sources))
         pose = index % self.task.sources if self.task.sources else None
-        vertices = body.rest if pose is None else body.posed[pose]
-        whole = dp.Mesh(vertices.double(), body.faces)
-        part = Partial(whole, torch.arange(whole.n_vertices))
+        whole = dp.Mesh(self._vertices(index).double(), body.faces)
+        part = Partial(whole, torch.arange(whole.n_vertices), torch.arange(whole.n_faces))
         if self.task.pieces:
             part = cut_pieces(whole, self.task.pieces, self.task.radii, self._generator(index))
         return Source(body, pose, *part, self._wks(part.mesh))
@@ -180,6 +213,8 @@ class BodyMaps(Dataset[Batch]):
     def _targets(self, index: int) -> _Targets:
         numbers = self.targets(index).tolist()
         bodies = {body: self._body(body) for body in {body for body, _ in numbers}}
+        if self.task.told == "nothing":
+            return _Targets(bodies[numbers[0][0]].rest[None], None, None)
         vertices = torch.stack([bodies[body].posed[pose] for body, pose in numbers])
         if self.task.told == "pose":
             parameters = torch.stack([bodies[body].poses[pose] for body, pose in numbers])
@@ -201,11 +236,15 @@ class BodyMaps(Dataset[Batch]):
         return None if self.resample else torch.Generator().manual_seed(index)
 
 
-class BodyCells(Dataset[Cells]):
-    """Random cells of each source, to train on without solves.
+class CellSampler:
+    """Draws random cells of some sources and their targets, to train on without solves.
+
+    Sources that are not maps to other bodies are reflected at random, with all that belongs to
+    them: as many bodies again.
 
     Args:
-        maps: the sources and targets.
+        maps: the sources and targets. Targets that may be other bodies are the same for all sources
+            of a step, so that they are encoded once.
         kind: faces or vertices, as the model wants.
         n_cells: how many of each source.
     """
@@ -213,70 +252,33 @@ class BodyCells(Dataset[Cells]):
     def __init__(self, maps: BodyMaps, kind: CellKind, n_cells: int) -> None:
         self.maps, self.kind, self.n_cells = maps, kind, n_cells
 
-    def __len__(self) -> int:
-        return len(self.maps)
+    def __call__(self, indices: Sequence[int]) -> Cells:
+        """Cells of the sources of these numbers."""
+        maps, task = self.maps, self.maps.task
+        surfaces = maps.surfaces(indices)
+        signs = 1 - 2 * torch.randint(2, (1 if task.others else len(indices),)).float()
+        code: dict[str, Tensor] = {"points": surfaces.points(maps.n_points)}
+        if task.others:
+            targets = maps.any_targets(maps.n_targets)
+        else:
+            own = [maps.own_targets(index) for index in indices]
+            targets = torch.stack([vertices for vertices, _ in own])
+            if task.told == "pose":
+                poses = torch.stack([parameters for _, parameters in own])
+                code["parameters"] = reflected(poses).where(signs[:, None, None] < 0, poses)
+        if task.told == "points":
+            code["target_points"] = self._points(targets)
+        return Cells.draw(self.kind, self.n_cells, surfaces, targets, **code).reflected(signs)
 
-    def __getitem__(self, index: int) -> Cells:
-        return self.maps.cells(index, self.kind, self.n_cells)
-
-
-class PosedPoints(NamedTuple):
-    """A source that is a target of others, too.
-
-    Attributes:
-        source: the body in its pose.
-        points: (s, f) what the encoder sees of it.
-    """
-
-    source: Source
-    points: Float[Tensor, "s f"]
-
-
-class PosedBodies(Dataset[PosedPoints]):
-    """The sources of maps, to be each other's targets.
-
-    Args:
-        maps: whose sources, all of them whole.
-
-    Raises:
-        ValueError: pieces are cut away, so that vertices of one are not those of another.
-    """
-
-    def __init__(self, maps: BodyMaps) -> None:
-        if maps.task.pieces:
-            raise ValueError("PosedBodies: bodies with pieces cut away are no targets of others")
-        self.maps = maps
-
-    def __len__(self) -> int:
-        return len(self.maps)
-
-    def __getitem__(self, index: int) -> PosedPoints:
-        return self.maps.posed_points(index)
-
-
-def paired_cells(
-    posed: Sequence[PosedPoints], kind: CellKind, n_cells: int, n_targets: int
-) -> Cells:
-    """Random cells of maps among some bodies, each a source and a target of as many others.
-
-    A body is encoded once for all maps from it and to it, so that a step has many more maps than
-    points to encode.
-
-    Args:
-        posed: the bodies.
-        kind: faces or vertices, as the model wants.
-        n_cells: how many of each source.
-        n_targets: of each source; all others, if they are fewer.
-    """
-    n = len(posed)
-    steps = 1 + torch.randperm(n - 1)[:n_targets]  # round to any but itself
-    partners = (torch.arange(n)[:, None] + steps) % n
-    x = torch.stack([body.source.mesh.vertices.float() for body in posed])
-    cells = [
-        Cells.draw(kind, n_cells, source.mesh, source.wks, x[others], points=points)
-        for (source, points), others in zip(posed, partners, strict=True)
-    ]
-    return replace(Cells.stack(cells), partners=partners)
+    def _points(self, targets: Float[Tensor, "b t n 3"]) -> Float[Tensor, "b t s f"]:
+        """What the encoder sees of the targets."""
+        vertices, n_energies = targets.flatten(0, 1), self.maps.n_energies
+        faces, wks = self.maps.bodies[0].faces, None
+        if n_energies:
+            meshes = [dp.Mesh(x.double(), faces) for x in vertices]
+            wks = torch.stack([dp.wave_kernel_signature(m, n_energies).float() for m in meshes])
+        points = Surfaces(vertices, faces, wks=wks).points(self.maps.n_points)
+        return points.unflatten(0, targets.shape[:2])
 
 
 def body_loader(maps: BodyMaps, *, shuffle: bool = False) -> DataLoader[Batch]:
@@ -284,20 +286,11 @@ def body_loader(maps: BodyMaps, *, shuffle: bool = False) -> DataLoader[Batch]:
     return DataLoader(maps, batch_size=None, shuffle=shuffle)
 
 
-def cell_loader(cells: BodyCells, n_sources: int) -> DataLoader[Cells]:
+def cell_loader(sampler: CellSampler, n_sources: int) -> DataLoader[Cells]:
     """Cells of so many sources a step, shuffled; of all, if there are fewer."""
-    n = min(n_sources, len(cells))
-    return DataLoader(cells, batch_size=n, shuffle=True, drop_last=True, collate_fn=Cells.stack)
-
-
-def pair_loader(
-    maps: BodyMaps, kind: CellKind, n_cells: int, n_sources: int, n_targets: int
-) -> DataLoader[Cells]:
-    """Cells of maps among so many sources a step, by `paired_cells`, shuffled."""
-    collate = partial(paired_cells, kind=kind, n_cells=n_cells, n_targets=n_targets)
-    n = min(n_sources, len(maps))
-    posed: Dataset[Any] = PosedBodies(maps)
-    return DataLoader(posed, batch_size=n, shuffle=True, drop_last=True, collate_fn=collate)
+    numbers: Any = range(len(sampler.maps))  # a list of numbers does for a data set
+    n = min(n_sources, len(sampler.maps))
+    return DataLoader(numbers, batch_size=n, shuffle=True, drop_last=True, collate_fn=sampler)
 
 
 # -------------------------------------------------------------------- evaluation
@@ -311,13 +304,13 @@ class MapRecord(MapErrors):
         body: number of the source's identity in its data set.
         source: number of the source's pose; None for the rest pose.
         target: number of the target's identity.
-        pose: number of the target's pose.
+        pose: number of the target's pose; None for the rest pose.
     """
 
     body: int
     source: int | None
     target: int
-    pose: int
+    pose: int | None
 
 
 @torch.no_grad()
@@ -343,7 +336,7 @@ def evaluate_maps(
                 body=source.body.number,
                 source=source.pose,
                 target=maps.bodies[body].number,
-                pose=pose,
+                pose=None if pose < 0 else pose,
             )
             for (body, pose), errors in zip(
                 maps.targets(index).tolist(),

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from njf_models.pointnet import PointNet
+from njf_models.rotation_vectors import rotation_matrices
 
 
 class CodedModel(nn.Module):
@@ -18,19 +19,37 @@ class CodedModel(nn.Module):
             source's alone.
         code_size: size of one code.
         parameters: number of user parameters appended to the code.
+        rotations: whether the parameters are rotation vectors, whose matrices the code has too: a
+            chain of joints multiplies matrices, and vectors say so only after an exponential.
+        code_scale: factor of what the encoder makes. Its entries are largest values of many points,
+            so that all shapes have much in common, and parameters in radians are small beside them.
 
     Attributes:
         code_size: size z of the whole code.
+        source_size: how many of its entries are of the source alone; they come first.
     """
 
     def __init__(
-        self, point_features: int, *, encodes_target: bool, code_size: int, parameters: int
+        self,
+        point_features: int,
+        *,
+        encodes_target: bool,
+        code_size: int,
+        parameters: int,
+        rotations: bool = False,
+        code_scale: float = 1.0,
     ) -> None:
         super().__init__()
-        self.encodes_target = encodes_target
+        if rotations and parameters % 3:
+            raise ValueError(
+                f"rotations are vectors of three parameters each, got {parameters} parameters"
+            )
+        self.encodes_target, self.rotations = encodes_target, rotations
+        self.code_scale = code_scale
         self.encoder = PointNet(point_features, code_size) if point_features else None
         n_codes = (1 + encodes_target) if point_features else 0
-        self.code_size = n_codes * code_size + parameters
+        self.source_size = code_size if point_features else 0
+        self.code_size = n_codes * code_size + (4 if rotations else 1) * parameters
 
     def encode(
         self,
@@ -54,8 +73,8 @@ class CodedModel(nn.Module):
             raise ValueError(
                 f"encode: this model encodes {expected} point cloud(s), got {len(clouds)}"
             )
-        codes = [self.encoder(cloud) for cloud in clouds] if self.encoder is not None else []
-        codes += [] if parameters is None else [parameters]
+        codes = [self.encode_shape(cloud) for cloud in clouds]
+        codes += [] if parameters is None else [self._with_matrices(parameters)]
         batch = torch.broadcast_shapes(*(code.shape[:-1] for code in codes))
         code = torch.cat([code.expand(*batch, -1) for code in codes], dim=-1)
         if code.shape[-1] != self.code_size:
@@ -65,19 +84,37 @@ class CodedModel(nn.Module):
             )
         return code
 
-    def encode_pairs(
-        self, points: Float[Tensor, "b s f"], partners: Int[Tensor, "b t"]
-    ) -> Float[Tensor, "b t z"]:
-        """The codes of maps among b shapes, each of which is encoded once.
+    def told(
+        self,
+        target: Float[Tensor, "*#batch t f"] | None,
+        parameters: Float[Tensor, "*#batch p"] | None,
+    ) -> Float[Tensor, "*batch z"]:
+        """What of the code is of the target: from points on it, or from parameters, or both.
 
         Args:
-            points: (b, s, f) point features of the shapes.
-            partners: (b, t) which of them the targets of each are.
+            target: (…, t, f) point features.
+            parameters: (…, p) user parameters.
+        """
+        codes = [] if target is None else [self.encode_shape(target)]
+        codes += [] if parameters is None else [self._with_matrices(parameters)]
+        batch = torch.broadcast_shapes(*(code.shape[:-1] for code in codes))
+        return torch.cat([code.expand(*batch, -1) for code in codes], dim=-1)
+
+    def encode_shape(self, points: Float[Tensor, "*batch s f"]) -> Float[Tensor, "*batch k"]:
+        """The code of a shape, source or target, from points on it.
 
         Raises:
-            ValueError: the model's code is not [source code | target code].
+            ValueError: the model has no encoder.
         """
-        if self.encoder is None or not self.encodes_target:
-            raise ValueError("encode_pairs: this needs a model that encodes source and target")
-        codes = self.encoder(points)
-        return torch.cat([codes[:, None].expand(-1, partners.shape[1], -1), codes[partners]], -1)
+        if self.encoder is None:
+            raise ValueError("encode_shape: this model encodes no shapes")
+        code = self.encoder(points)
+        return code if self.code_scale == 1 else self.code_scale * code
+
+    def _with_matrices(self, parameters: Float[Tensor, "*batch p"]) -> Float[Tensor, "*batch q"]:
+        """The parameters, and the matrices less the identity of the rotations that they are."""
+        if not self.rotations:
+            return parameters
+        matrices = rotation_matrices(parameters.unflatten(-1, (-1, 3)))
+        identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+        return torch.cat([parameters, (matrices - identity).flatten(-3)], dim=-1)

@@ -14,6 +14,9 @@ from torch.nn import functional
 # Of larger arrays it returns every one to the system, and page faults cost as much as the layers.
 _ROWS = 2048
 
+# Shares of parts, at the start of a training, are those of the nearest few parts, not of all alike.
+_SHARPNESS = 3.0
+
 
 class FieldMLP(nn.Module):
     """Five linear layers, 128 wide, group norms between; the last starts at zero: the identity map.
@@ -113,98 +116,96 @@ def _scaled_relu(x: Float[Tensor, "*rows channels"], norm: nn.GroupNorm) -> Tens
     return torch.addcmul(norm.bias, scaled, norm.weight).relu_()
 
 
-class BilinearField(nn.Module):
-    """Σₖ hₖ(code) Tₖ(features): a network of the code and one of the face, multiplied at last.
+class PartField(nn.Module):
+    """Σₖ wₖ(face, source) Mₖ(code): a few matrices for each map, blended over the surface.
 
-    As many functions on the surface as `rank`, and coefficients for each map. T does not depend on
-    the code, so that a step evaluates it once for all of its maps, and a map costs a product. Good
-    where one source has many targets, and a nonlinear code: T is a small network, h may be a large
-    one.
+    As in skinning, where a surface moves with its bones. The weights w are a network of each face
+    and of the source's part of the code, so that a step evaluates them once for all maps of a
+    source; the matrices M are a network of the whole code, evaluated once for each map. So a map
+    costs a product of two small arrays. Some weights are shares, which sum to one at each face, as
+    of bones; others may be anything, for what happens between the bones.
 
     Args:
-        code_size: size of the global code.
+        code_size: size of the global code, of which the source's part comes first.
+        source_size: size of the source's part.
         in_features: number of features of each face.
         out_features: number of outputs per face, the entries of its matrix.
-        width: size of the hidden layers of T; those of h are four times as wide.
-        rank: number of functions.
+        parts: number of matrices, a quarter of which have shares for weights.
+        width: size of the hidden layers of w; those of M are half as wide again.
     """
 
     def __init__(
         self,
         code_size: int,
+        source_size: int,
         in_features: int,
         out_features: int = 9,
+        *,
+        parts: int = 128,
         width: int = 128,
-        rank: int = 128,
     ) -> None:
         super().__init__()
-        self.rank, self.out_features = rank, out_features
-        self.of_code = layered((code_size, *[4 * width] * 3, rank))
-        self.of_face = layered((in_features, *[width] * 3, rank * out_features))
-        last = self.of_face[-1]
+        if parts % 4:
+            raise ValueError(f"PartField: the number of parts must be a multiple of 4, got {parts}")
+        self.source_size, self.out_features = source_size, out_features
+        self.shares = parts // 4
+        self.of_face = FieldMLP(source_size, in_features, parts, width)
+        last = self.of_face.layers[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.normal_(last.weight, std=width**-0.5)  # not zero, or no part would differ
+        self.of_code = _smooth((code_size, *[3 * width // 2] * 3, parts * out_features))
+        last = self.of_code[-1]
         assert isinstance(last, nn.Linear)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
 
     def forward(
         self,
-        features: Float[Tensor, "m f"],
-        code: Float[Tensor, "*batch z"],
-        part_of_face: Int[Tensor, "m"] | None = None,
-    ) -> Float[Tensor, "*any out"]:
-        """Outputs for every face; arguments as of `FieldMLP`."""
-        return self.combined(self.functions(features), code, part_of_face)
-
-    def functions(self, features: Float[Tensor, "m f"]) -> Float[Tensor, "m k out"]:
-        """T of every face, for all maps."""
-        return self.of_face(features).unflatten(-1, (self.rank, self.out_features))
-
-    def combined(
-        self,
-        functions: Float[Tensor, "m k out"],
-        code: Float[Tensor, "*batch z"],
-        part_of_face: Int[Tensor, "m"] | None,
-    ) -> Float[Tensor, "*any out"]:
-        """Outputs for every face from T of every face; the rest as for a call."""
-        h = self.of_code(code.reshape(-1, code.shape[-1]))
-        if part_of_face is not None:
-            return torch.einsum("mk,mko->mo", h[part_of_face], functions)
-        outputs = h @ functions.transpose(0, 1).flatten(1)  # (batch, m · out)
-        return outputs.view(*code.shape[:-1], len(functions), self.out_features)
-
-    def on(self, features: Float[Tensor, "m f"]) -> FieldOnFaces:
-        """This field on given faces, of which T is evaluated now, for inference."""
-        return FieldOnFaces(self, features)
-
-
-class FieldOnFaces(nn.Module):
-    """A bilinear field whose functions are known at the faces of one shape.
-
-    Args:
-        field: whose.
-        features: (m, f) of the faces.
-    """
-
-    def __init__(self, field: BilinearField, features: Float[Tensor, "m f"]) -> None:
-        super().__init__()
-        self.field, self.features = field, features
-        with torch.no_grad():
-            self.functions = field.functions(features)
-
-    def forward(
-        self,
-        features: Float[Tensor, "m f"],
+        features: Float[Tensor, "*#batch m f"],
         code: Float[Tensor, "*batch z"],
         part_of_face: Int[Tensor, "m"] | None = None,
     ) -> Float[Tensor, "*any out"]:
         """Outputs for every face.
 
+        Args:
+            features: (m, f) features of the faces of one source; or (b, 1, m, f), of several.
+            code: (…, z) codes of maps of the one source, or (b, t, z) of t maps of each of several.
+            part_of_face: (m,) the code, one of (parts, z), that belongs to each face, if the
+                surface is packed.
+
+        Returns:
+            (…, m, out), or (m, out) if packed.
+
         Raises:
-            ValueError: other features than those it was made for.
+            ValueError: maps of one source have codes of different sources.
         """
-        if features is not self.features:
-            raise ValueError("FieldOnFaces: this field is on the faces of another shape")
-        return self.field.combined(self.functions, code, part_of_face)
+        M = self._matrices(code)
+        if part_of_face is not None:
+            w = self._weights(features, code[:, : self.source_size], part_of_face)
+            return torch.einsum("mk,mko->mo", w, M[part_of_face])
+        if features.ndim > 2:
+            source = self._one_source(code[..., : self.source_size])
+            return self._weights(features[:, 0], source)[:, None] @ M
+        source = self._one_source(code.reshape(-1, code.shape[-1])[:, : self.source_size])
+        return self._weights(features, source) @ M
+
+    def _one_source(self, sources: Float[Tensor, "*b t z"]) -> Float[Tensor, "*b z"]:
+        first = sources[..., :1, :]
+        if not torch.equal(first.expand_as(sources), sources):
+            raise ValueError(
+                "PartField: the maps of one shape have codes of different sources; encode the "
+                "shape once, for all of its maps"
+            )
+        return first.squeeze(-2)
+
+    def _weights(self, *arguments: Tensor) -> Float[Tensor, "*b m k"]:
+        w = self.of_face(*arguments)
+        shares, others = w.split((self.shares, w.shape[-1] - self.shares), dim=-1)
+        return torch.cat([(_SHARPNESS * shares).softmax(-1), others], dim=-1)
+
+    def _matrices(self, code: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch k out"]:
+        M = self.of_code(code.reshape(-1, code.shape[-1]))
+        return M.view(*code.shape[:-1], -1, self.out_features)
 
 
 def layered(sizes: tuple[int, ...]) -> nn.Sequential:
@@ -212,4 +213,15 @@ def layered(sizes: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for fan_in, fan_out in itertools.pairwise(sizes[:-1]):
         layers += [nn.Linear(fan_in, fan_out), nn.GroupNorm(4, fan_out), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
+
+
+def _smooth(sizes: tuple[int, ...]) -> nn.Sequential:
+    """Linear layers for a smooth function of a code: with ReLU, poses end up half as far again off.
+
+    Each hidden layer is normed as a whole.
+    """
+    layers: list[nn.Module] = []
+    for fan_in, fan_out in itertools.pairwise(sizes[:-1]):
+        layers += [nn.Linear(fan_in, fan_out), nn.LayerNorm(fan_out), nn.SiLU()]
     return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))

@@ -6,6 +6,7 @@ from njf_models.baselines.cages import CageDeformation
 from njf_models.baselines.diffusion import DiffusionMap
 from njf_models.baselines.displacement import DisplacementField
 from njf_models.baselines.global_mlp import GlobalMLP
+from njf_models.chain import ChainedNJF
 from njf_models.diffusion_njf import DiffusionEncodedNJF
 from njf_models.modal_njf import ModalNJF
 from njf_models.njf import NeuralJacobianField
@@ -18,6 +19,7 @@ Model = (
     | DiffusionMap
     | DiffusionEncodedNJF
     | ModalNJF
+    | ChainedNJF
 )
 MODELS: dict[str, type[Model]] = {
     "njf": NeuralJacobianField,
@@ -27,4 +29,5 @@ MODELS: dict[str, type[Model]] = {
     "diffusion": DiffusionMap,
     "diffusion+njf": DiffusionEncodedNJF,
     "modal": ModalNJF,
+    "chain": ChainedNJF,
 }

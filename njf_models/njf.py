@@ -7,18 +7,17 @@ and a global step, as in local/global optimisation of a distortion energy (Liu e
 
 from __future__ import annotations
 
-import copy
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 import diffpoisson as dp
 from diffpoisson.arguments import require_integer
 from njf_models.encoding import CodedModel
 from njf_models.features import Shape
-from njf_models.field import BilinearField, FieldMLP, FieldOnFaces
+from njf_models.field import FieldMLP, PartField
 from njf_models.sampled import CellKind, Cells
 
 Centering = Literal["area", "vertex"]
@@ -57,7 +56,8 @@ class NeuralJacobianField(CodedModel):
         centering: whether the emitted map has area-weighted mean zero on each component (the
             paper), or its plain mean over vertices is zero (the authors' experiments).
         width: size of the field's hidden layers.
-        rank: make the first field a `field.BilinearField` of that rank; 0 for the paper's MLP.
+        parts: make the first field a `field.PartField` of so many parts; 0 for the paper's MLP.
+        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "faces"
@@ -76,13 +76,15 @@ class NeuralJacobianField(CodedModel):
         centering: Centering = "area",
         width: int = 128,
         local_step: bool = False,
-        rank: int = 0,
+        parts: int = 0,
+        **coding: Any,
     ) -> None:
         super().__init__(
             point_features,
             encodes_target=encodes_target,
             code_size=code_size,
             parameters=parameters,
+            **coding,
         )
         if centering not in ("area", "vertex"):
             raise ValueError(f"centering must be 'area' or 'vertex', got {centering!r}")
@@ -92,9 +94,16 @@ class NeuralJacobianField(CodedModel):
         self.output_dim, self.centering = output_dim, centering
         self.rounds, self.shared_rounds, self.local_step = rounds, shared_rounds, local_step
         entries = output_dim * 3
-        self.field: FieldMLP | BilinearField | FieldOnFaces
-        if rank:
-            self.field = BilinearField(self.code_size, face_features, entries, width, rank)
+        self.field: FieldMLP | PartField
+        if parts:
+            self.field = PartField(
+                self.code_size,
+                self.source_size,
+                face_features,
+                entries,
+                parts=parts,
+                width=width,
+            )
         else:
             self.field = FieldMLP(self.code_size, face_features, entries, width)
         self.corrections = nn.ModuleList(
@@ -112,21 +121,6 @@ class NeuralJacobianField(CodedModel):
         """
         return self.iterates(shape, code)[-1]
 
-    def on(self, shape: Shape) -> NeuralJacobianField:
-        """A network for inference on this shape alone, for many maps of it.
-
-        What of the field does not depend on the code is evaluated now, once.
-
-        Raises:
-            ValueError: the model's field is not of low rank, so that all of it depends on the code.
-        """
-        if not isinstance(self.field, BilinearField):
-            raise ValueError("NeuralJacobianField.on: this needs a model with rank > 0")
-        model = copy.copy(self)
-        model._modules = dict(self._modules)
-        model.field = self.field.on(shape.features)
-        return model.eval()
-
     def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
         """The maps after each round; arguments as for a call."""
         mesh = shape.mesh
@@ -136,14 +130,12 @@ class NeuralJacobianField(CodedModel):
                 f"NeuralJacobianField: {mesh.n_parts} concatenated shapes need codes of shape "
                 f"({mesh.n_parts}, z), got {tuple(code.shape)}"
             )
-        offsets = self.field(shape.features, code, part_of_face)
-        identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
-        predictions = [self._solved(shape, identity + self._matrices(offsets))]
+        predictions = [self.solved(shape, self.matrices(shape.features, code, part_of_face))]
         for k in range(self.rounds - 1):
             correction = self.corrections[0 if self.shared_rounds else k]
             base, seen = self._read_back(shape, predictions[-1])
             offsets = correction(seen, code, part_of_face)
-            predictions.append(self._solved(shape, base + self._matrices(offsets)))
+            predictions.append(self.solved(shape, base + self._matrices(offsets)))
         return predictions
 
     def at(self, cells: Cells, code: Float[Tensor, "b t z"]) -> Float[Tensor, "b t k c 2"]:
@@ -164,19 +156,40 @@ class NeuralJacobianField(CodedModel):
             )
         if cells.frames is None:
             raise ValueError("NeuralJacobianField.at: cells must be faces, with their frames")
-        offsets = self.field(cells.features[:, None], code)
-        identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
-        P = (identity + self._matrices(offsets)).to(cells.frames.dtype)
+        P = self.matrices(cells.features[:, None], code).to(cells.frames.dtype)
         # `restrict` has one frame for each face, here of all shapes: (t, b k, c, 3).
         R = dp.restrict(P.transpose(0, 1).flatten(1, 2), cells.frames.flatten(0, 1))
         return R.unflatten(1, (len(P), -1)).transpose(0, 1)
 
+    def matrices(
+        self,
+        features: Float[Tensor, "*#batch m f"],
+        code: Float[Tensor, "*batch z"],
+        part_of_face: Int[Tensor, "m"] | None = None,
+    ) -> Float[Tensor, "*any c 3"]:
+        """P of the first prediction, I plus what the field says; arguments as of `FieldMLP`."""
+        offsets = self.field(features, code, part_of_face)
+        identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
+        return identity + self._matrices(offsets)
+
     def _matrices(self, outputs: Float[Tensor, "*any entries"]) -> Float[Tensor, "*any c 3"]:
         return outputs.unflatten(-1, (self.output_dim, 3))
 
-    def _solved(self, shape: Shape, P: Float[Tensor, "*batch m c 3"]) -> Prediction:
+    def solved(
+        self,
+        shape: Shape,
+        P: Float[Tensor, "*batch m c 3"],
+        base: Float[Tensor, "m 3 2"] | None = None,
+    ) -> Prediction:
+        """The map of matrices: R = P B, solved and centred.
+
+        Args:
+            shape: the source.
+            P: matrices of its faces.
+            base: (m, 3, 2) Jacobians of a map that this one follows, instead of B: R = P J.
+        """
         P = P.to(shape.frames.dtype)  # under autocast the field answers in half precision
-        R = dp.restrict(P, shape.frames)
+        R = dp.restrict(P, shape.frames if base is None else base)
         phi = shape.solver(R)
         if self.centering == "vertex":
             phi = centre_vertices(shape, phi)

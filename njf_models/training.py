@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,7 +26,6 @@ from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
 from njf_models.datasets.uv import UVPatch
-from njf_models.encoding import CodedModel
 from njf_models.features import Motions, Shape, point_features
 from njf_models.losses import LOSSES, PER_SHAPE, Loss, distortion_loss, sampled_loss
 from njf_models.metrics import count_flips
@@ -216,6 +216,12 @@ class _Stopwatch:
         self.earlier, self.started = self.seconds, None
 
 
+def rate_share(step: int, steps: int, warmup: int) -> float:
+    """Share of the learning rate at a step: it rises along a line, and falls along a cosine."""
+    rise = min(1.0, (step + 1) / warmup) if warmup else 1.0
+    return rise * (1 + math.cos(math.pi * step / steps)) / 2
+
+
 class NJFTraining(lightning.LightningModule):
     """Training with Adam, by the paper's schedule or by a cosine.
 
@@ -225,6 +231,7 @@ class NJFTraining(lightning.LightningModule):
         learning_rate: of Adam, at the start.
         patience: validations without improvement before the rate falls to a tenth (the paper).
         steps: let the rate fall to zero along a cosine over so many steps instead.
+        warmup: and rise to it in so many.
         inputs: fields of `trained.Inputs`, what the network sees, for the record.
         kind: one of `models.MODELS`: Neural Jacobian Fields, or a baseline.
 
@@ -240,6 +247,7 @@ class NJFTraining(lightning.LightningModule):
         learning_rate: float = 1e-3,
         patience: int = 10,
         steps: int | None = None,
+        warmup: int = 0,
         inputs: dict[str, Any] | None = None,
         kind: str = "njf",
     ) -> None:
@@ -251,7 +259,8 @@ class NJFTraining(lightning.LightningModule):
         self.model = MODELS[kind](**model)
         if self.objective.augment and self.model.output_dim != 2:
             raise ValueError("NJFTraining: augment turns planar maps; set output_dim=2 or leave it")
-        self.learning_rate, self.patience, self.steps = learning_rate, patience, steps
+        self.learning_rate, self.patience = learning_rate, patience
+        self.steps, self.warmup = steps, warmup
         self._wall, self._cpu = _Stopwatch(time.perf_counter), _Stopwatch(time.process_time)
 
     def training_step(self, batch: Batch | Cells, batch_idx: int) -> Tensor:
@@ -271,7 +280,9 @@ class NJFTraining(lightning.LightningModule):
             raise ValueError(
                 f"NJFTraining: samples are trained by the paper's loss alone, not {self.objective}"
             )
-        code = encoded_cells(self.model, cells)
+        # One cloud for all targets of a shape.
+        points = cells.points[:, None]
+        code = self.model.encode(points, cells.target_points, cells.parameters)
         loss = sampled_loss(self.model.at(cells, code), cells.target)
         size = code.shape[:2].numel()
         self.log(
@@ -327,8 +338,11 @@ class NJFTraining(lightning.LightningModule):
         """Adam and the schedule of its rate."""
         optimizer = torch.optim.Adam(self.parameters(), lr=self.learning_rate)
         if self.steps is not None:
-            cosine = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
-            scheduler = {"scheduler": cosine, "interval": "step"}
+            steps, warmup = self.steps, self.warmup
+            schedule = torch.optim.lr_scheduler.LambdaLR(
+                optimizer, lambda step: rate_share(step, steps, warmup)
+            )
+            scheduler = {"scheduler": schedule, "interval": "step"}
         else:
             plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(
                 optimizer, factor=0.1, patience=self.patience, min_lr=self.learning_rate / 10
@@ -346,20 +360,6 @@ class NJFTraining(lightning.LightningModule):
 def encoded(model: Model, batch: Batch) -> Float[Tensor, "*t z"]:
     """The codes of a batch's maps."""
     return model.encode(batch.points, batch.target_points, batch.parameters)
-
-
-def encoded_cells(model: Model, cells: Cells) -> Float[Tensor, "b t z"]:
-    """The codes of the maps of samples; a shape that is source and target is encoded once.
-
-    Raises:
-        ValueError: there are such, and the model doesn't encode source and target alike.
-    """
-    if cells.partners is None:
-        points = cells.points[:, None]  # one cloud for all targets of a shape
-        return model.encode(points, cells.target_points, cells.parameters)
-    if not isinstance(model, CodedModel):
-        raise ValueError(f"encoded_cells: {type(model).__name__} does not learn maps among shapes")
-    return model.encode_pairs(cells.points, cells.partners)
 
 
 def loader(examples: UVExamples, batch_size: int, *, shuffle: bool = False) -> DataLoader[Example]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 from jaxtyping import Float
@@ -44,6 +44,7 @@ class CageDeformation(WholeShapes, CodedModel):
         centering: see `NeuralJacobianField`.
         width: size of the hidden layers.
         cage_faces: number of faces of a cage.
+        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
     """
 
     output_dim = 3
@@ -59,12 +60,14 @@ class CageDeformation(WholeShapes, CodedModel):
         centering: Centering = "area",
         width: int = 128,
         cage_faces: int = 400,
+        **coding: Any,
     ) -> None:
         super().__init__(
             point_features,
             encodes_target=encodes_target,
             code_size=code_size,
             parameters=parameters,
+            **coding,
         )
         self.centering, self.cage_faces = centering, cage_faces
         self.field = FieldMLP(self.code_size, 6, 3, width)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 import diffpoisson as dp
 from njf_models.encoding import CodedModel
 from njf_models.features import Shape
-from njf_models.field import FieldMLP
+from njf_models.field import FieldMLP, PartField
 from njf_models.njf import Centering, Prediction, centre_areas, centre_vertices
 from njf_models.sampled import CellKind, Cells
 
@@ -27,6 +27,8 @@ class DisplacementField(CodedModel):
         output_dim: c, 3 for maps to space, 2 for maps to the plane.
         centering: see `NeuralJacobianField`.
         width: size of the hidden layers.
+        parts: as of `NeuralJacobianField`, to tell what its field alone brings.
+        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "vertices"
@@ -42,15 +44,29 @@ class DisplacementField(CodedModel):
         output_dim: int = 3,
         centering: Centering = "area",
         width: int = 128,
+        parts: int = 0,
+        **coding: Any,
     ) -> None:
         super().__init__(
             point_features,
             encodes_target=encodes_target,
             code_size=code_size,
             parameters=parameters,
+            **coding,
         )
         self.output_dim, self.centering = output_dim, centering
-        self.field = FieldMLP(self.code_size, face_features, output_dim, width)
+        self.field: FieldMLP | PartField
+        if parts:
+            self.field = PartField(
+                self.code_size,
+                self.source_size,
+                face_features,
+                output_dim,
+                parts=parts,
+                width=width,
+            )
+        else:
+            self.field = FieldMLP(self.code_size, face_features, output_dim, width)
 
     def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
         """The map of a shape for each code; arguments as of `NeuralJacobianField`.

@@ -26,6 +26,7 @@ from njf_models.datasets.fingerprint import fingerprint
 from njf_models.datasets.poses import JOINTS, sample_pose
 from njf_models.datasets.store import StoreError, write_atomically
 from njf_models.datasets.triangulation import Triangulation
+from njf_models.rotation_vectors import rotation_matrices
 
 POSE_SIZE = 3 * len(JOINTS)
 _FORMAT = 1  # change it with anything that changes the bodies
@@ -100,21 +101,15 @@ class BodyModel:
             (p, n, 3) float32.
         """
         transforms = torch.eye(4).repeat(len(poses), self._anny.bone_count, 1, 1)
-        transforms[:, self._joints, :3, :3] = _rotations(poses.float().unflatten(-1, (-1, 3)))
+        transforms[:, self._joints, :3, :3] = rotation_matrices(
+            poses.float().unflatten(-1, (-1, 3))
+        )
         phenotypes = phenotype.float().expand(len(poses), -1)
         return self._anny(pose_parameters=transforms, phenotype_kwargs=phenotypes)["vertices"]
 
     def intersecting(self, vertices: Float[Tensor, "n 3"]) -> float:
         """Share of the faces that cut another one; of faces that follow one bone, none counts."""
         return float((self._collisions.detect_self_intersections(vertices) >= 0).float().mean())
-
-
-def _rotations(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices: the exponential of the cross product with the vectors."""
-    x, y, z = vectors.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1)
-    return torch.linalg.matrix_exp(cross.unflatten(-1, (3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +123,8 @@ class Body:
         rest: (n, 3) float32 vertices in the rest pose, in metres.
         poses: (p, 60) float32 pose parameters.
         posed: (p, n, 3) float32 vertices in these poses.
+        carried: (s, n, 3) float32 where networks took its vertices from the first s poses, for
+            others to start from; None where none did.
     """
 
     number: int
@@ -136,6 +133,7 @@ class Body:
     rest: Float[Tensor, "n 3"]
     poses: Float[Tensor, "p 60"]
     posed: Float[Tensor, "p n 3"]
+    carried: Float[Tensor, "s n 3"] | None = None
 
 
 @dataclass(frozen=True)

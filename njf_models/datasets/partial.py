@@ -18,10 +18,12 @@ class Partial(NamedTuple):
     Attributes:
         mesh: one component.
         kept: (k,) vertices of the whole mesh that its vertices are.
+        faces: (j,) faces of the whole mesh that its faces are.
     """
 
     mesh: dp.Mesh
     kept: Int[Tensor, "k"]
+    faces: Int[Tensor, "j"]
 
 
 def cut_pieces(
@@ -48,10 +50,11 @@ def cut_pieces(
     outside = (torch.cdist(mesh.centroids, at) > radius).all(dim=1)
     if not outside.any():
         raise ValueError(f"cut_pieces: {n_pieces} balls of radii {radii} leave nothing of the mesh")
-    faces = mesh.faces[outside]
-    labels = torch.from_numpy(component_labels(faces.numpy(), mesh.n_vertices)).long()
+    left = outside.nonzero()[:, 0]
+    labels = torch.from_numpy(component_labels(mesh.faces[left].numpy(), mesh.n_vertices)).long()
+    component = labels[mesh.faces[left, 0]]
     areas = mesh.areas.new_zeros(mesh.n_vertices)
-    areas.index_add_(0, labels[faces[:, 0]], mesh.areas[outside])
-    faces = faces[labels[faces[:, 0]] == areas.argmax()]
-    kept, numbers = faces.unique(return_inverse=True)
-    return Partial(dp.Mesh(mesh.vertices[kept], numbers), kept)
+    areas.index_add_(0, component, mesh.areas[left])
+    left = left[component == areas.argmax()]
+    kept, numbers = mesh.faces[left].unique(return_inverse=True)
+    return Partial(dp.Mesh(mesh.vertices[kept], numbers), kept, left)

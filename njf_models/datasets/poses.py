@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 Limits = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
 
@@ -109,6 +111,14 @@ def sample_pose(rng: np.random.Generator, heading: float = 0.0) -> Float[np.ndar
     vectors = np.deg2rad(np.stack([pose[name] for name in JOINTS]))
     vectors[0, 2] = rng.uniform(-heading, heading)
     return vectors
+
+
+def reflected(poses: Float[Tensor, "*batch 60"]) -> Float[Tensor, "*batch 60"]:
+    """The poses of a body's mirror image: left and right change places."""
+    names = [name.translate(str.maketrans("LR", "RL")) if "." in name else name for name in JOINTS]
+    partners = [JOINTS.index(name) for name in names]
+    mirror = torch.from_numpy(_MIRROR).to(poses)
+    return (poses.unflatten(-1, (-1, 3))[..., partners, :] * mirror).flatten(-2)
 
 
 def _triangular(rng: np.random.Generator, limits: Limits) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.testing import assert_close
 
 from njf_models import NeuralJacobianField, Shape
-from njf_models.field import BilinearField, FieldMLP
+from njf_models.field import FieldMLP, PartField
 from njf_models.pointnet import PointNet
 from tests.njf_models.shapes import bumpy_disk, ellipsoid, prepared, randomised
 
@@ -125,50 +127,67 @@ def test_pointnet_code_size(code_size):
     assert PointNet(6, code_size)(torch.randn(1, 10, 6)).shape == (1, code_size)
 
 
-def bilinear(**options):
-    return randomised(BilinearField(5, 6, width=8, rank=7, **options))
+def in_parts(**options):
+    field = PartField(12, 5, 6, parts=8, width=8, **options)
+    return randomised(field)
 
 
-def test_a_bilinear_field_is_a_sum_of_products():
-    """By hand, for codes of any batch; and for the parts of a packed batch."""
-    field, features = bilinear(), torch.randn(11, 6, dtype=torch.float64)
-    code = torch.randn(2, 3, 5, dtype=torch.float64)
-    functions = field.of_face(features).view(11, 7, 9)
+def test_a_part_field_is_a_sum_of_matrices_weighted_by_face_and_source():
+    """By hand, for one source and codes of any batch; for several; and for a packed batch."""
+    field, features = in_parts(), torch.randn(11, 6, dtype=torch.float64)
+    sources, told = torch.randn(2, 5).double(), torch.randn(2, 3, 7).double()
+    code = torch.cat([sources[:, None].expand(-1, 3, -1), told], dim=-1)
     expected = torch.zeros(2, 3, 11, 9, dtype=torch.float64)
-    for k in range(7):
-        h = field.of_code(code.view(6, 5))[:, k].view(2, 3, 1, 1)
-        expected = expected + h * functions[:, k]
-    assert_close(field(features, code), expected, rtol=1e-9, atol=1e-9)
-    assert_close(field(features, code[0, 0]), expected[0, 0], rtol=1e-9, atol=1e-9)
-    part = torch.arange(11) % 3
-    packed = field(features, code[0], part)
-    assert_close(packed, expected[0, part, torch.arange(11)], rtol=1e-9, atol=1e-9)
+    for i in range(2):
+        w = field.of_face(features, sources[i])
+        shares = (3 * w[:, :2]).exp()
+        w = torch.cat([shares / shares.sum(1, keepdim=True), w[:, 2:]], dim=1)
+        for t in range(3):
+            M = field.of_code(code[i, t][None]).view(8, 9)
+            for k in range(8):
+                expected[i, t] += w[:, k, None] * M[k]
+    near = {"rtol": 1e-9, "atol": 1e-9}
+    assert_close(field(features, code[0]), expected[0], **near)
+    assert_close(field(features, code[1, 2]), expected[1, 2], **near)
+    assert_close(field(features, code[1][None]), expected[1][None], **near)
+    assert_close(field(features.expand(2, 1, -1, -1), code), expected, **near)
+    part = torch.arange(11) % 2
+    packed = field(features, code[:, 1], part)
+    assert_close(packed, expected[part, 1, torch.arange(11)], **near)
+    with pytest.raises(ValueError, match="codes of different sources"):
+        field(features, code[:, 0])
+    with pytest.raises(ValueError, match="a multiple of 4, got 6"):
+        PartField(12, 5, 6, parts=6)
 
 
-def test_a_bilinear_field_starts_at_the_identity_and_learns():
+def test_a_part_field_starts_at_the_identity_and_learns():
     mesh = ellipsoid()
     shape = prepared(mesh)
-    model = NeuralJacobianField(6, 0, parameters=5, rank=7).double()
+    model = NeuralJacobianField(6, 0, parameters=5, parts=8).double()
     code = torch.randn(3, 5, dtype=torch.float64)
     prediction = model(shape, code)
     assert_close(prediction.jacobians, mesh.frames.expand(3, -1, -1, -1), rtol=0, atol=1e-12)
     prediction.vertices.square().sum().backward()
-    assert model.field.of_face[-1].weight.grad.abs().max() > 0
+    assert model.field.of_code[-1].weight.grad.abs().max() > 0
     union = Shape.concatenate([shape, prepared(bumpy_disk())])
     packed = randomised(model)(union, code[:2])
     alone = model(shape, code[0]).vertices
     assert_close(union.mesh.split_vertices(packed.vertices)[0], alone, rtol=1e-9, atol=1e-9)
 
 
-def test_a_network_on_one_shape():
-    """The same maps; the network itself stays what it is, and other shapes are refused."""
-    shape, other = prepared(ellipsoid()), prepared(ellipsoid(1))
-    model = randomised(NeuralJacobianField(6, 0, parameters=5, rank=7))
-    fixed, code = model.on(shape), torch.randn(2, 5, dtype=torch.float64)
-    assert_close(fixed(shape, code).vertices, model(shape, code).vertices, rtol=1e-12, atol=1e-12)
-    assert isinstance(model.field, BilinearField)
-    model(other, code)
-    with pytest.raises(ValueError, match="the faces of another shape"):
-        fixed(other, code)
-    with pytest.raises(ValueError, match="rank > 0"):
-        NeuralJacobianField(6, 0, parameters=5).on(shape)
+def test_a_code_has_the_matrices_of_its_rotations_and_its_shapes_scaled():
+    model = NeuralJacobianField(6, 6, code_size=8, parameters=6, rotations=True, code_scale=0.1)
+    points, vectors = torch.randn(1, 20, 6), torch.randn(4, 2, 3)
+    vectors[0] = 0
+    code = model.encode(points, None, vectors.flatten(1))
+    assert code.shape == (4, 8 + 6 + 18) == (4, model.code_size)
+    assert_close(code[:, :8], 0.1 * model.encoder(points).expand(4, -1))
+    assert_close(code[:, 8:14], vectors.flatten(1))
+    for row, pair in zip(code, vectors, strict=True):
+        expected = Rotation.from_rotvec(pair.numpy()).as_matrix() - np.eye(3)
+        assert_close(row[14:], torch.from_numpy(expected.reshape(-1)).float(), atol=1e-6, rtol=1e-5)
+    assert_close(model.told(None, vectors.flatten(1)), code[:, 8:])
+    with pytest.raises(ValueError, match="three parameters each, got 7"):
+        NeuralJacobianField(6, 6, parameters=7, rotations=True)
+    with pytest.raises(ValueError, match="encodes no shapes"):
+        NeuralJacobianField(6, 0, parameters=7).encode_shape(points)

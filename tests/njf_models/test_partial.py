@@ -25,13 +25,14 @@ def tube(n: int = 40) -> dp.Mesh:
 def test_what_is_left_is_outside_of_all_balls_and_connected(seed):
     mesh = dp.Mesh(*meshes.sphere(seed, subdivisions=3))
     generator = torch.Generator().manual_seed(seed)
-    part, kept = cut_pieces(mesh, 2, (0.3, 0.5), generator)
+    part, kept, chosen = cut_pieces(mesh, 2, (0.3, 0.5), generator)
     assert torch.equal(part.vertices, mesh.vertices[kept])
     assert part.n_components == 1
     faces = {tuple(sorted(face)) for face in mesh.faces.tolist()}
     left = [tuple(sorted(face)) for face in kept[part.faces].tolist()]
     assert set(left) < faces
     assert len(set(left)) == len(left)
+    assert torch.equal(kept[part.faces], mesh.faces[chosen])
     # The same balls again.
     generator.manual_seed(seed)
     samples = dp.sample_surface(mesh, 2, generator=generator)
@@ -51,7 +52,7 @@ def test_what_is_left_is_outside_of_all_balls_and_connected(seed):
 def test_the_larger_part_is_kept():
     mesh = tube()
     for seed in range(8):
-        part, kept = cut_pieces(mesh, 1, (1.5, 1.5), torch.Generator().manual_seed(seed))
+        part, kept, _ = cut_pieces(mesh, 1, (1.5, 1.5), torch.Generator().manual_seed(seed))
         assert part.n_components == 1
         assert float(part.areas.sum()) > 0.4 * float(mesh.areas.sum())
         assert len(kept) == part.n_vertices < mesh.n_vertices

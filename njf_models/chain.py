@@ -1,0 +1,123 @@
+"""Maps one after another: each network starts from where the one before took the surface.
+
+A character in some pose can be taken to rest first, and from there to any other pose, by a network
+that has to know but one start. By the chain rule the Jacobians of the composed map are products, so
+that all solves are on the source, with its one factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+import diffpoisson as dp
+from njf_models.features import Shape, face_features, point_features
+from njf_models.njf import NeuralJacobianField, Prediction
+from njf_models.sampled import WholeShapes
+
+
+class Start(NamedTuple):
+    """Where the last network of a chain starts from on one shape.
+
+    Attributes:
+        vertices: (n, 3) where those before took the surface.
+        jacobians: (m, 3, 2) J of that map.
+        features: (m, f) features of its faces there.
+        code: (z,) what the last network's encoder makes of it.
+    """
+
+    vertices: Float[Tensor, "n 3"]
+    jacobians: Float[Tensor, "m 3 2"]
+    features: Float[Tensor, "m f"]
+    code: Float[Tensor, "z"]
+
+
+class ChainedNJF(WholeShapes, nn.Module):
+    """Rᵢ = Pᵢ Jᵢ₋₁, Φᵢ = L⁻¹ ∇ᵀ A Rᵢ for one network after another, Jᵢ the Jacobians of Φᵢ.
+
+    Each Pᵢ is predicted from Φᵢ₋₁: of its faces and of points on it. All but the last network are
+    told nothing else; what a user says of the target is for the last one. They are trained one by
+    one, each on surfaces that those before have carried (`carried.carry`).
+
+    Args:
+        links: arguments of each `NeuralJacobianField`, of one round.
+        n_points: how many points their encoders see.
+    """
+
+    output_dim = 3
+
+    def __init__(self, links: Sequence[dict[str, Any]], n_points: int) -> None:
+        super().__init__()
+        self.links = nn.ModuleList(NeuralJacobianField(**arguments) for arguments in links)
+        self.n_points = n_points
+
+    @classmethod
+    def of(cls, networks: Sequence[NeuralJacobianField], n_points: int) -> ChainedNJF:
+        """A chain of trained networks.
+
+        Raises:
+            ValueError: there are none, or one has more than one round.
+        """
+        if not networks or any(network.rounds > 1 for network in networks):
+            raise ValueError("ChainedNJF.of: this needs networks, of one round each")
+        chain = cls([], n_points)
+        chain.links = nn.ModuleList(networks)
+        return chain.eval()
+
+    def encode(
+        self,
+        source: Float[Tensor, "*#batch s f"] | None = None,
+        target: Float[Tensor, "*#batch t f"] | None = None,
+        parameters: Float[Tensor, "*#batch p"] | None = None,
+    ) -> Float[Tensor, "*batch z"]:
+        """What the last network is told of the targets; the sources' codes are made on the way.
+
+        Args:
+            source: not used.
+            target: (…, t, f) point features of the targets, if it encodes them.
+            parameters: (…, p) user parameters, if it has any.
+        """
+        if target is None and parameters is None:
+            assert source is not None
+            return source.new_zeros(*source.shape[:-2], 0)
+        return self._last.told(target, parameters)
+
+    def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
+        """The map of one shape for each code of `encode`."""
+        return self.finish(shape, self.start(shape), code)
+
+    def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
+        """The one map; as of a model with rounds."""
+        return [self(shape, code)]
+
+    @torch.no_grad()
+    def start(self, shape: Shape) -> Start:
+        """What of the maps does not depend on the target: all but the last network, a constant."""
+        vertices, J = shape.mesh.vertices, shape.frames
+        samples = dp.sample_surface(
+            shape.mesh, self.n_points, generator=torch.Generator().manual_seed(0)
+        )
+        for link in self.links:
+            assert isinstance(link, NeuralJacobianField)
+            mesh = shape.mesh.with_vertices(vertices.to(shape.mesh.dtype))
+            features = face_features(mesh).to(shape.features.dtype)
+            code = link.encode_shape(point_features(mesh, samples).to(features.dtype)[None])[0]
+            if link is not self._last:
+                prediction = link.solved(shape, link.matrices(features, code), J)
+                vertices, J = prediction.vertices, dp.jacobians(shape.mesh, prediction.vertices)
+        return Start(vertices, J, features, code)
+
+    def finish(self, shape: Shape, start: Start, code: Float[Tensor, "*batch z"]) -> Prediction:
+        """The maps from there, for each code of `encode`."""
+        code = torch.cat([start.code.expand(*code.shape[:-1], -1), code], dim=-1)
+        return self._last.solved(shape, self._last.matrices(start.features, code), start.jacobians)
+
+    @property
+    def _last(self) -> NeuralJacobianField:
+        last = self.links[-1]
+        assert isinstance(last, NeuralJacobianField)
+        return last

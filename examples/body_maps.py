@@ -161,6 +161,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
     add("--models", nargs="+", choices=KINDS, help="which to train (ours, displacement, cages)")
     add("--validations", type=int, default=10, metavar="N", help="in a training (10)")
+    add("--scattered", action="store_true", help="see faces as other triangulations have them")
     add("--after", type=Path, nargs="+", default=[], metavar="RUN", help="start where these lead")
     add("--carried", type=int, default=8, metavar="N", help="of a body's poses, for that (8)")
     add("--init", type=Path, metavar="RUN", help="begin with the networks of another folder")
@@ -256,7 +257,9 @@ def loaders(
     phases: dict[str, DataLoader[Any]] = {}
     samples = MODELS[kind.removesuffix("-parts")].samples
     if samples is not None:
-        phases["sampled"] = cell_loader(CellSampler(maps, samples, how.cells), how.per_step)
+        phases["sampled"] = cell_loader(
+            CellSampler(maps, samples, how.cells, scattered=options.scattered), how.per_step
+        )
     if samples is None or options.whole > 0:
         phases["whole"] = body_loader(maps, shuffle=True)
     return phases

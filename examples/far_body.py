@@ -48,7 +48,8 @@ FAR = {
 def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     options = parse(argv)
     options.out.mkdir(parents=True, exist_ok=True)
-    network = ReposeNetwork.from_checkpoint(options.run / "njf" / "checkpoints" / "best.ckpt")
+    runs = [*options.after, options.run]
+    network = ReposeNetwork.chained([run / "njf" / "checkpoints" / "best.ckpt" for run in runs])
     near = BodyStore(options.data / "test", 1)[0]
     near = replace(near, poses=near.poses[: options.poses], posed=near.posed[: options.poses])
     table: dict[str, dict[str, float]] = {}
@@ -69,6 +70,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--run", type=Path, default=Path("runs/repose"), help="a run of body_maps.py")
+    add("--after", type=Path, nargs="+", default=[], metavar="RUN", help="as of body_maps.py")
     add("--data", type=Path, help="folder of the bodies (RUN/bodies)")
     add("--out", type=Path, default=Path("runs/far"), help="folder for results (runs/far)")
     add("--poses", type=int, default=8, metavar="N", help="test poses (8)")

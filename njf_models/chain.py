@@ -16,24 +16,61 @@ from torch import Tensor, nn
 
 import diffpoisson as dp
 from njf_models.features import Shape, face_features, point_features
+from njf_models.field import PartField
 from njf_models.njf import NeuralJacobianField, Prediction
 from njf_models.sampled import WholeShapes
 
 
 class Start(NamedTuple):
-    """Where the last network of a chain starts from on one shape.
+    """What of a network's maps of one shape does not depend on the target.
 
     Attributes:
-        vertices: (n, 3) where those before took the surface.
-        jacobians: (m, 3, 2) J of that map.
+        vertices: (n, 3) where the maps start: the surface, or where other networks took it.
+        jacobians: (m, 3, 2) J of that map; the shape's frames, if it is the surface.
         features: (m, f) features of its faces there.
-        code: (z,) what the last network's encoder makes of it.
+        code: (z,) what the network's encoder makes of it.
+        weights: (m, k) those of its field of parts; None if it has another.
     """
 
     vertices: Float[Tensor, "n 3"]
     jacobians: Float[Tensor, "m 3 2"]
     features: Float[Tensor, "m f"]
     code: Float[Tensor, "z"]
+    weights: Float[Tensor, "m k"] | None
+
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls,
+        network: NeuralJacobianField,
+        vertices: Float[Tensor, "n 3"],
+        jacobians: Float[Tensor, "m 3 2"],
+        features: Float[Tensor, "m f"],
+        points: Float[Tensor, "s f"],
+    ) -> Start:
+        """A network's start, a constant, from the points that its encoder sees there."""
+        code = network.encode_shape(points[None])[0]
+        field = network.field
+        weights = field.weights(features, code) if isinstance(field, PartField) else None
+        return cls(vertices, jacobians, features, code, weights)
+
+    def finish(
+        self, network: NeuralJacobianField, shape: Shape, told: Float[Tensor, "*batch z"]
+    ) -> Prediction:
+        """The network's maps from here.
+
+        Args:
+            network: whose start this is.
+            shape: the source.
+            told: (…, z) what the code says of the targets, `CodedModel.told`.
+        """
+        code = torch.cat([self.code.expand(*told.shape[:-1], -1), told], dim=-1)
+        if self.weights is None:
+            P = network.matrices(self.features, code)
+        else:
+            assert isinstance(network.field, PartField)
+            P = network.from_identity(self.weights @ network.field.parts(code))
+        return network.solved(shape, P, self.jacobians)
 
 
 class ChainedNJF(WholeShapes, nn.Module):
@@ -84,11 +121,11 @@ class ChainedNJF(WholeShapes, nn.Module):
         if target is None and parameters is None:
             assert source is not None
             return source.new_zeros(*source.shape[:-2], 0)
-        return self._last.told(target, parameters)
+        return self.last.told(target, parameters)
 
     def forward(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> Prediction:
         """The map of one shape for each code of `encode`."""
-        return self.finish(shape, self.start(shape), code)
+        return self.start(shape).finish(self.last, shape, code)
 
     def iterates(self, shape: Shape, code: Float[Tensor, "*batch z"]) -> list[Prediction]:
         """The one map; as of a model with rounds."""
@@ -96,7 +133,7 @@ class ChainedNJF(WholeShapes, nn.Module):
 
     @torch.no_grad()
     def start(self, shape: Shape) -> Start:
-        """What of the maps does not depend on the target: all but the last network, a constant."""
+        """Where the last network starts: all the others' work, a constant."""
         vertices, J = shape.mesh.vertices, shape.frames
         samples = dp.sample_surface(
             shape.mesh, self.n_points, generator=torch.Generator().manual_seed(0)
@@ -104,20 +141,17 @@ class ChainedNJF(WholeShapes, nn.Module):
         for link in self.links:
             assert isinstance(link, NeuralJacobianField)
             mesh = shape.mesh.with_vertices(vertices.to(shape.mesh.dtype))
-            features = face_features(mesh).to(shape.features.dtype)
-            code = link.encode_shape(point_features(mesh, samples).to(features.dtype)[None])[0]
-            if link is not self._last:
-                prediction = link.solved(shape, link.matrices(features, code), J)
-                vertices, J = prediction.vertices, dp.jacobians(shape.mesh, prediction.vertices)
-        return Start(vertices, J, features, code)
-
-    def finish(self, shape: Shape, start: Start, code: Float[Tensor, "*batch z"]) -> Prediction:
-        """The maps from there, for each code of `encode`."""
-        code = torch.cat([start.code.expand(*code.shape[:-1], -1), code], dim=-1)
-        return self._last.solved(shape, self._last.matrices(start.features, code), start.jacobians)
+            dtype = shape.features.dtype
+            points = point_features(mesh, samples).to(dtype)
+            start = Start.of(link, vertices, J, face_features(mesh).to(dtype), points)
+            if link is not self.last:
+                vertices = start.finish(link, shape, start.code.new_zeros(0)).vertices
+                J = dp.jacobians(shape.mesh, vertices)
+        return start
 
     @property
-    def _last(self) -> NeuralJacobianField:
+    def last(self) -> NeuralJacobianField:
+        """The network that is told of the targets."""
         last = self.links[-1]
         assert isinstance(last, NeuralJacobianField)
         return last

@@ -179,15 +179,31 @@ class PartField(nn.Module):
         Raises:
             ValueError: maps of one source have codes of different sources.
         """
-        M = self._matrices(code)
+        M = self.parts(code)
         if part_of_face is not None:
-            w = self._weights(features, code[:, : self.source_size], part_of_face)
+            w = self.weights(features, code[:, : self.source_size], part_of_face)
             return torch.einsum("mk,mko->mo", w, M[part_of_face])
         if features.ndim > 2:
             source = self._one_source(code[..., : self.source_size])
-            return self._weights(features[:, 0], source)[:, None] @ M
+            return self.weights(features[:, 0], source)[:, None] @ M
         source = self._one_source(code.reshape(-1, code.shape[-1])[:, : self.source_size])
-        return self._weights(features, source) @ M
+        return self.weights(features, source) @ M
+
+    def weights(
+        self,
+        features: Float[Tensor, "*any f"],
+        source: Float[Tensor, "*b z"],
+        part_of_face: Int[Tensor, "m"] | None = None,
+    ) -> Float[Tensor, "*any k"]:
+        """w of each face; arguments as of `FieldMLP`, but the source's part of the codes only."""
+        w = self.of_face(features, source, part_of_face)
+        shares, others = w.split((self.shares, w.shape[-1] - self.shares), dim=-1)
+        return torch.cat([(_SHARPNESS * shares).softmax(-1), others], dim=-1)
+
+    def parts(self, code: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch k out"]:
+        """M of each map."""
+        M = self.of_code(code.reshape(-1, code.shape[-1]))
+        return M.view(*code.shape[:-1], -1, self.out_features)
 
     def _one_source(self, sources: Float[Tensor, "*b t z"]) -> Float[Tensor, "*b z"]:
         first = sources[..., :1, :]
@@ -197,15 +213,6 @@ class PartField(nn.Module):
                 "shape once, for all of its maps"
             )
         return first.squeeze(-2)
-
-    def _weights(self, *arguments: Tensor) -> Float[Tensor, "*b m k"]:
-        w = self.of_face(*arguments)
-        shares, others = w.split((self.shares, w.shape[-1] - self.shares), dim=-1)
-        return torch.cat([(_SHARPNESS * shares).softmax(-1), others], dim=-1)
-
-    def _matrices(self, code: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch k out"]:
-        M = self.of_code(code.reshape(-1, code.shape[-1]))
-        return M.view(*code.shape[:-1], -1, self.out_features)
 
 
 def layered(sizes: tuple[int, ...]) -> nn.Sequential:

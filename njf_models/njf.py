@@ -168,7 +168,10 @@ class NeuralJacobianField(CodedModel):
         part_of_face: Int[Tensor, "m"] | None = None,
     ) -> Float[Tensor, "*any c 3"]:
         """P of the first prediction, I plus what the field says; arguments as of `FieldMLP`."""
-        offsets = self.field(features, code, part_of_face)
+        return self.from_identity(self.field(features, code, part_of_face))
+
+    def from_identity(self, offsets: Float[Tensor, "*any entries"]) -> Float[Tensor, "*any c 3"]:
+        """I plus matrices of which these are the entries."""
         identity = torch.eye(self.output_dim, 3, dtype=offsets.dtype, device=offsets.device)
         return identity + self._matrices(offsets)
 

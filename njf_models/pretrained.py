@@ -25,7 +25,7 @@ _POINTNET = "._PointNetEncoder__pointnet."
 @overload
 def load_pretrained(name: Literal["uv"] = "uv") -> UVNetwork: ...
 @overload
-def load_pretrained(name: Literal["repose"]) -> ReposeNetwork: ...
+def load_pretrained(name: Literal["repose", "repose-any"]) -> ReposeNetwork: ...
 @overload
 def load_pretrained(name: str) -> UVNetwork | ReposeNetwork: ...
 def load_pretrained(name: str = "uv") -> UVNetwork | ReposeNetwork:
@@ -33,7 +33,7 @@ def load_pretrained(name: str = "uv") -> UVNetwork | ReposeNetwork:
 
     Args:
         name: "uv", for maps of surfaces to the plane; "uv-pointnet", the same without eigenpairs;
-            or "repose", for bodies in other poses.
+            "repose", for bodies from rest to poses; or "repose-any", from any pose.
 
     Raises:
         ValueError: there are no weights of that name.
@@ -43,7 +43,7 @@ def load_pretrained(name: str = "uv") -> UVNetwork | ReposeNetwork:
 
 @cache
 def _load(name: str) -> UVNetwork | ReposeNetwork:
-    kind = ReposeNetwork if name == "repose" else UVNetwork
+    kind = ReposeNetwork if name.startswith("repose") else UVNetwork
     return kind.load(_file(name, ".safetensors"))
 
 

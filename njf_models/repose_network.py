@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -9,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import diffpoisson as dp
+from njf_models.chain import ChainedNJF, Start
 from njf_models.features import Shape
 from njf_models.njf import NeuralJacobianField
 from njf_models.trained import TrainedNetwork
@@ -46,26 +49,52 @@ class PreparedBody(NamedTuple):
 
     Attributes:
         shape: with its factor and features.
-        code: (z,) what the encoder makes of its surface.
+        start: of its maps; where a chain of networks has taken it, if the network is one.
         centre: (3,) area-weighted mean of the surface.
     """
 
     shape: Shape
-    code: Float[Tensor, "z"]
+    start: Start
     centre: Float[Tensor, "3"]
 
 
 class ReposeNetwork(TrainedNetwork):
-    """A network for the maps of bodies from rest to poses, with the poses as parameters."""
+    """A network for maps of bodies to poses, with the poses as parameters.
+
+    From the rest pose; or, if it is a chain that takes a body to rest first, from any.
+    """
 
     holds: ClassVar[str] = "repose_network"
+
+    @classmethod
+    def chained(cls, checkpoints: Sequence[Path]) -> ReposeNetwork:
+        """The networks in several checkpoints of `training.NJFTraining`, one after another.
+
+        Args:
+            checkpoints: all but the last of networks that take bodies nearer to rest.
+
+        Raises:
+            ValueError: their encoders see different numbers of points.
+        """
+        links = [cls.from_checkpoint(path) for path in checkpoints]
+        if len(links) == 1:
+            return links[0]
+        if len({link.inputs for link in links}) != 1:
+            raise ValueError(f"ReposeNetwork.chained: inputs of {checkpoints} differ")
+        inputs = links[0].inputs
+        arguments = {"links": [link.arguments for link in links], "n_points": inputs.n_points}
+        network = cls(arguments, inputs, "chain")
+        chain = ChainedNJF.of([link._last for link in links], inputs.n_points)
+        network.model.load_state_dict(chain.state_dict())
+        return network
 
     def repose(self, mesh: dp.Mesh, poses: Float[Tensor, "p k"]) -> Float[Tensor, "p n 3"]:
         """A body in other poses.
 
         Args:
-            mesh: a body in the rest pose of `datasets.poses`, in metres: x to its left, y to its
-                back, z up. It may have any triangulation, and stand anywhere.
+            mesh: a body in the rest pose of `datasets.poses`, or in any if the network is a chain;
+                in metres, x to its left, y to its back, z up. It may have any triangulation, and
+                stand anywhere.
             poses: rotation vectors of `datasets.poses.JOINTS`, in radians.
 
         Returns:
@@ -75,18 +104,26 @@ class ReposeNetwork(TrainedNetwork):
 
     @torch.no_grad()
     def prepare(self, mesh: dp.Mesh) -> PreparedBody:
-        """What depends on the body alone: factor, features and code."""
+        """What depends on the body alone: factor, features and code; and the way to rest."""
         mesh = mesh.to(torch.float64)
         shape, points = self.inputs.of(mesh)
         centre = mesh.vertex_areas @ mesh.vertices / mesh.areas.sum()
-        assert isinstance(self.model, NeuralJacobianField)
-        assert self.model.encoder is not None
-        return PreparedBody(shape, self.model.encoder(points[None])[0], centre)
+        if isinstance(self.model, ChainedNJF):
+            return PreparedBody(shape, self.model.start(shape), centre)
+        start = Start.of(self._last, mesh.vertices, shape.frames, shape.features, points)
+        return PreparedBody(shape, start, centre)
 
     @torch.no_grad()
     def repose_prepared(
         self, body: PreparedBody, poses: Float[Tensor, "p k"]
     ) -> Float[Tensor, "p n 3"]:
         """A body that was prepared before, in other poses; float64."""
-        code = torch.cat([body.code.expand(len(poses), -1), poses.float()], dim=-1)
-        return self.model(body.shape, code).vertices.double() + body.centre
+        told = self._last.told(None, poses.float())
+        return body.start.finish(self._last, body.shape, told).vertices.double() + body.centre
+
+    @property
+    def _last(self) -> NeuralJacobianField:
+        """The network that is told the pose."""
+        model = self.model.last if isinstance(self.model, ChainedNJF) else self.model
+        assert isinstance(model, NeuralJacobianField)
+        return model

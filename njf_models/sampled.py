@@ -46,6 +46,8 @@ class Cells:
         n_cells: int,
         surfaces: Surfaces,
         targets: Float[Tensor, "#b t n 3"],
+        *,
+        scattered: bool = False,
         **code: Any,
     ) -> Cells:
         """Cells of several shapes, drawn with replacement by their area.
@@ -56,10 +58,13 @@ class Cells:
             n_cells: how many of each.
             surfaces: the sources.
             targets: images of their vertices; (1, t, n, 3) if the same for all.
+            scattered: see a face as other triangulations may have it: at any of its points, not at
+                its centroid, and half of the time with the interpolated normal there.
             code: `points`, and `target_points` and `parameters` if there are any.
         """
-        of_faces = kind == "faces"
-        return (_faces if of_faces else _vertices)(n_cells, surfaces, targets, code)
+        if kind == "vertices":
+            return _vertices(n_cells, surfaces, targets, code)
+        return _faces(n_cells, surfaces, targets, code, scattered)
 
     def reflected(self, signs: Float[Tensor, "#b"]) -> Cells:
         """The same maps of the shapes' mirror images in x = 0, and of their targets', where told.
@@ -104,12 +109,14 @@ class Surfaces:
 
     def points(self, n_points: int) -> Float[Tensor, "b s f"]:
         """What PointNet sees, as `features.point_features` has it, of points drawn by area."""
-        chosen = self.draw(n_points)
-        corners = self._at(self.vertex_features, chosen)
+        return self.interpolated(self.draw(n_points))
+
+    def interpolated(self, chosen: Int[Tensor, "b k"]) -> Float[Tensor, "b k f"]:
+        """Features of the vertices, interpolated at a random point of each face."""
         u, v = torch.rand(2, *chosen.shape)
         root = u.sqrt()  # uniform on the triangle: Osada et al. 2002
         weights = torch.stack([1 - root, root * (1 - v), root * v], dim=-1)
-        return (corners * weights[..., None]).sum(-2)
+        return (self._at(self.vertex_features, chosen) * weights[..., None]).sum(-2)
 
     def draw(self, n_faces: int) -> Int[Tensor, "b k"]:
         """Faces of each surface, by area, with replacement."""
@@ -170,7 +177,9 @@ class Surfaces:
         return values[rows, self.faces[chosen]]
 
 
-def _faces(n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any]) -> Cells:
+def _faces(
+    n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any], scattered: bool
+) -> Cells:
     chosen = surfaces.draw(n)
     corners = surfaces.corners(chosen)
     edges = _edges(corners)
@@ -181,10 +190,23 @@ def _faces(n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any]) ->
     columns = [corners.mean(-2) - surfaces.centres, normal]
     if surfaces.wks is not None:
         columns.append(surfaces._at(surfaces.wks, chosen).mean(-2))
+    features = torch.cat(columns, dim=-1)
+    if scattered:
+        features = _scattered(features, surfaces.interpolated(chosen))
     # J takes the edges of the source, in its frame, to those of the target.
     to_frame = torch.linalg.inv(frames.mT @ edges)
     J = _edges(_images(targets, surfaces.faces[chosen])) @ to_frame[:, None]
-    return Cells(torch.cat(columns, dim=-1), J, frames=frames, **code)
+    return Cells(features, J, frames=frames, **code)
+
+
+def _scattered(
+    features: Float[Tensor, "b k f"], anywhere: Float[Tensor, "b k f"]
+) -> Float[Tensor, "b k f"]:
+    """Features at some point of each face: its own normal, or what is interpolated, made unit."""
+    x, n, rest = anywhere.split((3, 3, features.shape[-1] - 6), dim=-1)
+    n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
+    own = torch.rand(*n.shape[:2], 1) < 0.5
+    return torch.cat([x, features[..., 3:6].where(own, n), rest], dim=-1)
 
 
 def _vertices(n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any]) -> Cells:

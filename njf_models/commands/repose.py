@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Put a human character into another pose, without skeleton and skinning weights: a network predicts
 what the pose does to each triangle. The character stands with half-lowered arms, as in the picture
-of docs/bodies.md, x to its left.
+of docs/bodies.md, x to its left; or, with --any-pose, in whatever pose, upright.
 """
 
 _EPILOG = """\
@@ -27,6 +27,7 @@ examples:
   njf repose body.obj nod.obj --joint head 20 0 0 --joint neck01 10 0 0
   njf repose scan.glb some.obj --random 7 --y-up --height 1.75
   njf repose body.obj posed.obj --view
+  njf repose dancer.obj sitting.obj --any-pose --pose sitting.json
 
 A pose file is a JSON object: joints and their rotation vectors in degrees, {"head": [20, 0, 0]},
 about x, to the left, y, to the back, and z, up; other joints stay. --view serves a page
@@ -55,6 +56,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     pose.add_argument("--view", action="store_true", help="turn the joints in the browser")
     add("--port", type=int, default=8080, help="of the page of --view (8080)")
     add("--host", default="127.0.0.1", help="who may look (127.0.0.1: only you)")
+    add("--any-pose", action="store_true", help="the character stands in another pose than that")
     add("--y-up", action="store_true", help="y is up and z to the front; by default z is up")
     add("--height", type=float, metavar="M", help="of the character, if its unit is not the metre")
     return parser
@@ -82,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
     stance = Stance(options.y_up)
     if options.height is not None:
         stance = stance._replace(scale=options.height / stance.height(x))
-    network = load_pretrained("repose")
+    network = load_pretrained("repose-any" if options.any_pose else "repose")
     if pose is None:
         return _view(network, dp.Mesh(x, faces), stance, options)
     posed = network.repose(dp.Mesh(stance.standing(x), faces), pose)[0]

@@ -23,8 +23,9 @@ BODY = twisted(0)
 @pytest.fixture(autouse=True)
 def network(monkeypatch):
     """A random one: what it was trained on does not matter here."""
-    random = network_of()
-    monkeypatch.setattr(pretrained, "load_pretrained", {"repose": random}.__getitem__)
+    random, other = network_of(), network_of(8)
+    networks = {"repose": random, "repose-any": other}
+    monkeypatch.setattr(pretrained, "load_pretrained", networks.__getitem__)
     return random
 
 
@@ -53,6 +54,13 @@ def same_surface(path, expected):
     distance = torch.cdist(triangles, wanted)
     assert_close(distance.amin(1), torch.zeros(len(triangles)).double(), rtol=0, atol=1e-5)
     assert (distance.argmin(1).sort().values == torch.arange(len(wanted))).all()
+
+
+def test_characters_in_any_pose_have_the_network_for_that(character, tmp_path):
+    out, other = tmp_path / "posed.obj", network_of(8)
+    assert main(["repose", str(character), str(out), "--random", "3", "--any-pose"]) == 0
+    pose = sample_pose(np.random.default_rng(3))
+    same_surface(out, posed(other, pose))
 
 
 def test_joints_in_degrees(network, character, tmp_path, capsys):

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 import diffpoisson as dp
 import njf_models
-from njf_models.body_maps import BodyMaps, evaluate_maps
+from njf_models.body_maps import BodyMaps, Task, evaluate_maps
 from njf_models.pretrained import card
 from njf_models.repose_network import ReposeNetwork
 from njf_models.trained import Inputs
@@ -40,6 +40,41 @@ def test_poses_are_the_maps_of_evaluation_around_the_bodys_centre(n_energies):
     assert_close(areas @ posed, centre.expand(5, 3), rtol=0, atol=1e-6)
 
 
+def checkpoint(path, model, seed, n_points=32):
+    module = NJFTraining(model, steps=1, inputs={"n_points": n_points, "n_energies": 0})
+    randomised(module.model, seed).float()
+    trainer = make_trainer(path.parent, steps=1)
+    trainer.strategy.connect(module)
+    trainer.save_checkpoint(path)
+    return path
+
+
+def test_a_chain_re_poses_from_any_pose_and_is_prepared_once(tmp_path):
+    """The maps are those of evaluation; files keep them; the way to rest is not gone twice."""
+    unposing = {name: MODEL[name] for name in ("face_features", "point_features", "code_size")}
+    links = [unposing, unposing, MODEL | {"parts": 8, "rotations": True}]
+    paths = [checkpoint(tmp_path / f"{i}.ckpt", model, i) for i, model in enumerate(links)]
+    network = ReposeNetwork.chained(paths)
+    body = twisted(0)
+    mesh = dp.Mesh(body.posed[1].double(), body.faces)
+    posed = network.repose(mesh, body.poses)
+    _, [_, expected] = evaluate_maps(network.model, BodyMaps([body], Task(sources=2), n_points=32))
+    centre = mesh.vertex_areas @ mesh.vertices / mesh.areas.sum()
+    others = [0, 2, 3, 4]
+    assert_close(posed[others] - centre, expected.double(), rtol=1e-5, atol=1e-5)
+    network.save(tmp_path / "chain.safetensors")
+    loaded = ReposeNetwork.load(tmp_path / "chain.safetensors")
+    assert torch.equal(loaded.repose(mesh, body.poses), posed)
+    prepared = network.prepare(mesh)
+    for link in network.model.links[:-1]:
+        link.register_forward_pre_hook(lambda *_: pytest.fail("went to rest again"))
+        link.field.register_forward_pre_hook(lambda *_: pytest.fail("went to rest again"))
+    assert_close(network.repose_prepared(prepared, body.poses), posed)
+    odd = checkpoint(tmp_path / "odd.ckpt", MODEL, 0, n_points=16)
+    with pytest.raises(ValueError, match="differ"):
+        ReposeNetwork.chained([paths[0], odd])
+
+
 def test_where_a_body_stands_does_not_matter():
     body, network = twisted(1), network_of()
     shift = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)
@@ -67,16 +102,12 @@ def test_files_keep_all_that_the_maps_depend_on(tmp_path):
 
 
 def test_the_network_of_a_checkpoint(tmp_path):
-    inputs = {"n_points": 32, "n_energies": 0}
-    module = NJFTraining(MODEL, steps=1, inputs=inputs)
-    randomised(module.model).float()
-    trainer = make_trainer(tmp_path, steps=1)
-    trainer.strategy.connect(module)
-    trainer.save_checkpoint(tmp_path / "a.ckpt")
-    network = ReposeNetwork.from_checkpoint(tmp_path / "a.ckpt")
-    assert network.inputs == Inputs(**inputs)
-    for name, value in module.model.state_dict().items():
-        assert torch.equal(value, network.model.state_dict()[name])
+    path = checkpoint(tmp_path / "a.ckpt", MODEL, 0)
+    network = ReposeNetwork.from_checkpoint(path)
+    assert network.inputs == Inputs(n_points=32, n_energies=0)
+    saved = torch.load(path, weights_only=False)["state_dict"]
+    for name, value in network.model.state_dict().items():
+        assert torch.equal(value, saved[f"model.{name}"])
 
 
 def test_the_shipped_weights_are_those_of_their_card():

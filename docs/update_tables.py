@@ -455,9 +455,7 @@ def repose() -> str:
             *lines,
             "",
             f"Trained on {options['bodies']} bodies in {options['poses']} poses each, of "
-            f"{options['faces']:,} faces, code of size {options['code_size']}, one seed; a sampled "
-            f"step has {options['cells']} cells of {options['per_step']} bodies in "
-            f"{options['targets']} poses each, a whole one a body in as many. "
+            f"{options['faces']:,} faces, code of size {options['code_size']}, one seed. "
             f"{spent[0].upper()}{spent[1:]}.",
         ]
     )
@@ -466,6 +464,9 @@ def repose() -> str:
 def spent_on(cost: dict) -> str:
     """Steps and time of a training of `examples/body_maps.py`."""
     steps = " and ".join(f"{n:,} {phase}" for phase, n in cost["steps"].items())
+    if recipe := cost.get("recipe"):
+        poses = "pose" if recipe["targets"] == 1 else "poses"
+        steps += f" (of {recipe['per_step']} bodies in {recipe['targets']} {poses} each)"
     spent = f"{steps} steps, {cost['cpu seconds'] / 60:.1f} minutes of CPU time"
     if seconds := cost.get("earlier, cpu seconds"):
         spent += f", after {seconds / 60:.1f} of earlier trainings"

@@ -95,6 +95,7 @@ class Recipe(NamedTuple):
 IN_PARTS = Recipe(16, 24, 64, 3e-3, {"parts": 128, "width": 256})
 OF_EACH_FACE = Recipe(8, 8, 100, 2e-3)
 ONE_TARGET = Recipe(32, 1, 128, 2e-3)
+EARLIER = "earlier, cpu seconds"
 WARMUP = 300  # steps; with many parts, a start at the full rate ends in none being used
 
 
@@ -114,7 +115,12 @@ def main(argv: list[str] | None = None) -> dict[str, dict[str, float]]:
     for kind in options.models:
         title = KINDS[kind]
         checkpoint = fit(kind, steps[kind], train, validation, options)
-        costs[title] = {"steps": steps[kind], **cost(checkpoint), **earlier(title, options.init)}
+        costs[title] = {
+            "steps": steps[kind],
+            "recipe": recipe(kind, options)._asdict(),
+            **cost(checkpoint),
+            **earlier(title, options),
+        }
         network = load_checkpoint(checkpoint)
         if options.after:
             network = ChainedNJF.of([*earlier_networks(options), network], options.points)
@@ -161,7 +167,6 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
     add("--models", nargs="+", choices=KINDS, help="which to train (ours, displacement, cages)")
     add("--validations", type=int, default=10, metavar="N", help="in a training (10)")
-    add("--scattered", action="store_true", help="see faces as other triangulations have them")
     add("--after", type=Path, nargs="+", default=[], metavar="RUN", help="start where these lead")
     add("--carried", type=int, default=8, metavar="N", help="of a body's poses, for that (8)")
     add("--init", type=Path, metavar="RUN", help="begin with the networks of another folder")
@@ -172,6 +177,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         parser.set_defaults(**PAPER, steps=200_000)
         options = parser.parse_args(argv)
     options.out = options.out or Path("runs") / options.task
+    options.carried = min(options.carried, options.poses)
     options.models = options.models or ["njf", "displacement", "cages"]
     options.data = options.data or options.out / "bodies"
     return options
@@ -257,9 +263,7 @@ def loaders(
     phases: dict[str, DataLoader[Any]] = {}
     samples = MODELS[kind.removesuffix("-parts")].samples
     if samples is not None:
-        phases["sampled"] = cell_loader(
-            CellSampler(maps, samples, how.cells, scattered=options.scattered), how.per_step
-        )
+        phases["sampled"] = cell_loader(CellSampler(maps, samples, how.cells), how.per_step)
     if samples is None or options.whole > 0:
         phases["whole"] = body_loader(maps, shuffle=True)
     return phases
@@ -267,12 +271,12 @@ def loaders(
 
 def carried(bodies: BodyStore, options: argparse.Namespace, name: str) -> list[Body]:
     """Bodies and where the networks of `--after` take them."""
-    n_sources = options.carried if name == "train" else TASKS[options.task].sources
+    maps = maps_of(bodies, options, training=name == "train")
     return carry(
         bodies,
         earlier_networks(options),
         options.out / "carried" / name,
-        n_sources=n_sources if options.sources is None or name == "train" else options.sources,
+        n_sources=maps.task.sources,
         n_points=options.points,
     )
 
@@ -384,13 +388,16 @@ def cost(checkpoint: Path) -> dict[str, float | None]:
     return training_cost(checkpoint) | before
 
 
-def earlier(title: str, init: Path | None) -> dict[str, float]:
-    """The CPU time of the trainings that this one was begun with, if there are any on record."""
-    if init is None or not (init / "results.json").exists():
-        return {}
-    before = json.loads((init / "results.json").read_text())["training"][title]
-    key = "earlier, cpu seconds"
-    return {key: before["cpu seconds"] + before.get(key, 0.0)}
+def earlier(title: str, options: argparse.Namespace) -> dict[str, float]:
+    """The CPU time of trainings that this one was begun with or comes after, where on record."""
+    seconds = 0.0
+    for run in [options.init, *options.after]:
+        if run is not None and (run / "results.json").exists():
+            before = json.loads((run / "results.json").read_text())["training"][title]
+            seconds += before["cpu seconds"]
+            if run == options.init:
+                seconds += before.get(EARLIER, 0.0)
+    return {EARLIER: seconds} if seconds else {}
 
 
 def unmoved(options: argparse.Namespace, test: BodyStore) -> list[MapRecord]:

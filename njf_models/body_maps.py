@@ -247,13 +247,10 @@ class CellSampler:
             of a step, so that they are encoded once.
         kind: faces or vertices, as the model wants.
         n_cells: how many of each source.
-        scattered: see faces as other triangulations may have them; see `Cells.draw`.
     """
 
-    def __init__(
-        self, maps: BodyMaps, kind: CellKind, n_cells: int, *, scattered: bool = False
-    ) -> None:
-        self.maps, self.kind, self.n_cells, self.scattered = maps, kind, n_cells, scattered
+    def __init__(self, maps: BodyMaps, kind: CellKind, n_cells: int) -> None:
+        self.maps, self.kind, self.n_cells = maps, kind, n_cells
 
     def __call__(self, indices: Sequence[int]) -> Cells:
         """Cells of the sources of these numbers."""
@@ -271,10 +268,7 @@ class CellSampler:
                 code["parameters"] = reflected(poses).where(signs[:, None, None] < 0, poses)
         if task.told == "points":
             code["target_points"] = self._points(targets)
-        cells = Cells.draw(
-            self.kind, self.n_cells, surfaces, targets, scattered=self.scattered, **code
-        )
-        return cells.reflected(signs)
+        return Cells.draw(self.kind, self.n_cells, surfaces, targets, **code).reflected(signs)
 
     def _points(self, targets: Float[Tensor, "b t n 3"]) -> Float[Tensor, "b t s f"]:
         """What the encoder sees of the targets."""

@@ -24,11 +24,16 @@ def circumstances(options: argparse.Namespace) -> dict[str, Any]:
     """Options but for paths, torch and the machine, for a record in JSON."""
     return {
         "options": {
-            name: value for name, value in vars(options).items() if not isinstance(value, Path)
+            name: value for name, value in vars(options).items() if not _holds_paths(value)
         },
         "torch": torch.__version__,
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
     }
+
+
+def _holds_paths(value: Any) -> bool:
+    values = value if isinstance(value, list) else [value]
+    return any(isinstance(one, Path) for one in values)
 
 
 def training_cost(checkpoint: Path) -> dict[str, float | None]:

@@ -46,8 +46,6 @@ class Cells:
         n_cells: int,
         surfaces: Surfaces,
         targets: Float[Tensor, "#b t n 3"],
-        *,
-        scattered: bool = False,
         **code: Any,
     ) -> Cells:
         """Cells of several shapes, drawn with replacement by their area.
@@ -58,13 +56,9 @@ class Cells:
             n_cells: how many of each.
             surfaces: the sources.
             targets: images of their vertices; (1, t, n, 3) if the same for all.
-            scattered: see a face as other triangulations may have it: at any of its points, not at
-                its centroid, and half of the time with the interpolated normal there.
             code: `points`, and `target_points` and `parameters` if there are any.
         """
-        if kind == "vertices":
-            return _vertices(n_cells, surfaces, targets, code)
-        return _faces(n_cells, surfaces, targets, code, scattered)
+        return (_faces if kind == "faces" else _vertices)(n_cells, surfaces, targets, code)
 
     def reflected(self, signs: Float[Tensor, "#b"]) -> Cells:
         """The same maps of the shapes' mirror images in x = 0, and of their targets', where told.
@@ -109,10 +103,7 @@ class Surfaces:
 
     def points(self, n_points: int) -> Float[Tensor, "b s f"]:
         """What PointNet sees, as `features.point_features` has it, of points drawn by area."""
-        return self.interpolated(self.draw(n_points))
-
-    def interpolated(self, chosen: Int[Tensor, "b k"]) -> Float[Tensor, "b k f"]:
-        """Features of the vertices, interpolated at a random point of each face."""
+        chosen = self.draw(n_points)
         u, v = torch.rand(2, *chosen.shape)
         root = u.sqrt()  # uniform on the triangle: Osada et al. 2002
         weights = torch.stack([1 - root, root * (1 - v), root * v], dim=-1)
@@ -177,9 +168,7 @@ class Surfaces:
         return values[rows, self.faces[chosen]]
 
 
-def _faces(
-    n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any], scattered: bool
-) -> Cells:
+def _faces(n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any]) -> Cells:
     chosen = surfaces.draw(n)
     corners = surfaces.corners(chosen)
     edges = _edges(corners)
@@ -190,23 +179,10 @@ def _faces(
     columns = [corners.mean(-2) - surfaces.centres, normal]
     if surfaces.wks is not None:
         columns.append(surfaces._at(surfaces.wks, chosen).mean(-2))
-    features = torch.cat(columns, dim=-1)
-    if scattered:
-        features = _scattered(features, surfaces.interpolated(chosen))
     # J takes the edges of the source, in its frame, to those of the target.
     to_frame = torch.linalg.inv(frames.mT @ edges)
     J = _edges(_images(targets, surfaces.faces[chosen])) @ to_frame[:, None]
-    return Cells(features, J, frames=frames, **code)
-
-
-def _scattered(
-    features: Float[Tensor, "b k f"], anywhere: Float[Tensor, "b k f"]
-) -> Float[Tensor, "b k f"]:
-    """Features at some point of each face: its own normal, or what is interpolated, made unit."""
-    x, n, rest = anywhere.split((3, 3, features.shape[-1] - 6), dim=-1)
-    n = n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)
-    own = torch.rand(*n.shape[:2], 1) < 0.5
-    return torch.cat([x, features[..., 3:6].where(own, n), rest], dim=-1)
+    return Cells(torch.cat(columns, dim=-1), J, frames=frames, **code)
 
 
 def _vertices(n: int, surfaces: Surfaces, targets: Tensor, code: dict[str, Any]) -> Cells:

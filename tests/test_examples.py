@@ -84,15 +84,21 @@ def test_bodies(tmp_path):
     assert len(set(phenotypes)) == 3 + 2 + 2
     assert (tmp_path / "results.png").stat().st_size > 50_000
 
-    for task in ("any-pose", "registration", "morphing"):
+    for task in ("unpose", "any-pose", "registration", "morphing"):
         out, data = tmp_path / task, tmp_path / "bodies"
         common = [*sizes, *model, "--steps", "20", "--sources", "2", "--models", "njf"]
         common += ["--validations", "2"]
         common += ["--init", str(tmp_path)] if task == "any-pose" else []
+        if task in ("any-pose", "morphing"):
+            common += ["--after", str(tmp_path / "unpose"), "--whole", "0"]
         table = main([*common, "--task", task, "--out", str(out), "--data", str(data)])
-        assert table["ours"]["maps"] == 2 * 2 * (4 if task == "morphing" else 3)
+        per_source = {"unpose": 1, "any-pose": 3, "registration": 3, "morphing": 4}[task]
+        assert table["ours"]["maps"] == 2 * 2 * per_source
         assert 0 < table["ours"]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
         assert (out / "results.png").stat().st_size > 50_000
+    record = json.loads((tmp_path / "morphing" / "results.json").read_text())["training"]["ours"]
+    unposed = json.loads((tmp_path / "unpose" / "results.json").read_text())["training"]["ours"]
+    assert record["earlier, cpu seconds"] == unposed["cpu seconds"]
 
     main = runpy.run_path(str(ROOT / "examples" / "triangulations.py"))["main"]
     deviations = main(["--run", str(tmp_path), "--bodies", "1", "--poses", "2"])["ours"]
@@ -105,6 +111,8 @@ def test_bodies(tmp_path):
     main = runpy.run_path(str(ROOT / "examples" / "far_body.py"))["main"]
     out = tmp_path / "far"
     common = ["--run", str(tmp_path), "--out", str(out), "--poses", "2"]
+    table = main([*common, "--after", str(tmp_path / "unpose")])
+    assert all(0 < row["L2-V"] < 60 for row in table.values())
     table = main(common)
     assert set(table) == {"a test body", "a child", "a tall body", "very heavy"}
     assert all(row["maps"] == 2 and 0 < row["L2-V"] < 60 for row in table.values())

@@ -51,27 +51,24 @@ def test_uv_train(tmp_path, monkeypatch, network):
     assert uv.isfinite().all()
 
 
-@pytest.mark.slow
-def test_bodies(tmp_path):
-    """Models learn, on bodies that are nowhere twice; other tasks; other meshes; other bodies."""
+SIZES = ["--bodies", "3", "--poses", "4", "--held-out", "2", "--faces", "600"]
+SIZES += ["--code-size", "16", "--points", "32", "--energies", "0", "--targets", "4"]
+
+
+@pytest.fixture(scope="module", name="bodies_run")
+def re_posing(tmp_path_factory):
+    """A folder of `body_maps.py`, trained for seconds, and its table."""
+    folder = tmp_path_factory.mktemp("repose")
     main = runpy.run_path(str(ROOT / "examples" / "body_maps.py"))["main"]
-    sizes = ["--bodies", "3", "--poses", "4", "--held-out", "2", "--faces", "600"]
-    model = ["--code-size", "16", "--points", "32", "--energies", "0", "--targets", "4"]
-    table = main(
-        [
-            *sizes,
-            *model,
-            "--steps",
-            "60",
-            "--per-step",
-            "2",
-            "--cells",
-            "60",
-            "--out",
-            str(tmp_path),
-        ]
-    )
-    results = json.loads((tmp_path / "results.json").read_text())
+    steps = ["--steps", "60", "--per-step", "2", "--cells", "60"]
+    return folder, main([*SIZES, *steps, "--out", str(folder)])
+
+
+@pytest.mark.slow
+def test_bodies(bodies_run):
+    """Models learn, on bodies that are nowhere twice."""
+    folder, table = bodies_run
+    results = json.loads((folder / "results.json").read_text())
     assert results["summary"] == table
     assert sum(results["training"]["ours"]["steps"].values()) == 60
     assert set(results["training"]["cages"]["steps"]) == {"whole"}
@@ -79,29 +76,43 @@ def test_bodies(tmp_path):
         assert table[name]["maps"] == 2 * 4
         assert table[name]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
         assert results["training"][name]["cpu seconds"] > 0
-    kept = {name: BodyStore(tmp_path / "bodies" / name) for name in ("train", "validation", "test")}
-    phenotypes = [tuple(body.phenotype.tolist()) for store in kept.values() for body in store]
+    kept = [BodyStore(folder / "bodies" / name) for name in ("train", "validation", "test")]
+    phenotypes = [tuple(body.phenotype.tolist()) for store in kept for body in store]
     assert len(set(phenotypes)) == 3 + 2 + 2
-    assert (tmp_path / "results.png").stat().st_size > 50_000
+    assert (folder / "results.png").stat().st_size > 50_000
 
-    for task in ("unpose", "any-pose", "registration", "morphing"):
-        out, data = tmp_path / task, tmp_path / "bodies"
-        common = [*sizes, *model, "--steps", "20", "--sources", "2", "--models", "njf"]
+
+@pytest.mark.slow
+def test_tasks_of_bodies(bodies_run, tmp_path):
+    """The other tasks, two of them by a chain of networks."""
+    main = runpy.run_path(str(ROOT / "examples" / "body_maps.py"))["main"]
+    data = bodies_run[0] / "bodies"
+    spent = {}
+    for task, per_source in (("unpose", 1), ("any-pose", 3), ("registration", 3), ("morphing", 4)):
+        out = tmp_path / task
+        common = [*SIZES, "--steps", "20", "--sources", "2", "--models", "njf"]
         common += ["--validations", "2"]
-        common += ["--init", str(tmp_path)] if task == "any-pose" else []
+        common += ["--init", str(bodies_run[0])] if task == "any-pose" else []
         if task in ("any-pose", "morphing"):
             common += ["--after", str(tmp_path / "unpose"), "--whole", "0"]
         table = main([*common, "--task", task, "--out", str(out), "--data", str(data)])
-        per_source = {"unpose": 1, "any-pose": 3, "registration": 3, "morphing": 4}[task]
         assert table["ours"]["maps"] == 2 * 2 * per_source
         assert 0 < table["ours"]["L2-V"] < 1.2 * table["untrained"]["L2-V"]
         assert (out / "results.png").stat().st_size > 50_000
-    record = json.loads((tmp_path / "morphing" / "results.json").read_text())["training"]["ours"]
-    unposed = json.loads((tmp_path / "unpose" / "results.json").read_text())["training"]["ours"]
-    assert record["earlier, cpu seconds"] == unposed["cpu seconds"]
+        spent[task] = json.loads((out / "results.json").read_text())["training"]["ours"]
+    assert spent["morphing"]["earlier, cpu seconds"] == spent["unpose"]["cpu seconds"]
+    assert spent["any-pose"]["earlier, cpu seconds"] > spent["unpose"]["cpu seconds"]
+    far = runpy.run_path(str(ROOT / "examples" / "far_body.py"))["main"]
+    runs = ["--run", str(tmp_path / "any-pose"), "--after", str(tmp_path / "unpose")]
+    table = far([*runs, "--data", str(data), "--out", str(tmp_path / "far"), "--poses", "2"])
+    assert all(0 < row["L2-V"] < 60 for row in table.values())
 
+
+@pytest.mark.slow
+def test_bodies_on_other_meshes_and_other_bodies(bodies_run, tmp_path):
+    folder, _ = bodies_run
     main = runpy.run_path(str(ROOT / "examples" / "triangulations.py"))["main"]
-    deviations = main(["--run", str(tmp_path), "--bodies", "1", "--poses", "2"])["ours"]
+    deviations = main(["--run", str(folder), "--bodies", "1", "--poses", "2"])["ours"]
     assert deviations["trained on"].deviation < 1e-6
     assert deviations["original"].n_faces == 26692
     for name in ("original", "Loop-subdivided", "four times as many"):
@@ -110,22 +121,20 @@ def test_bodies(tmp_path):
     # Bodies unlike those of training, by the same network.
     main = runpy.run_path(str(ROOT / "examples" / "far_body.py"))["main"]
     out = tmp_path / "far"
-    common = ["--run", str(tmp_path), "--out", str(out), "--poses", "2"]
-    table = main([*common, "--after", str(tmp_path / "unpose")])
-    assert all(0 < row["L2-V"] < 60 for row in table.values())
+    common = ["--run", str(folder), "--out", str(out), "--poses", "2"]
     table = main(common)
     assert set(table) == {"a test body", "a child", "a tall body", "very heavy"}
     assert all(row["maps"] == 2 and 0 < row["L2-V"] < 60 for row in table.values())
     assert json.loads((out / "far.json").read_text()) == table
     # A file whose y is up, twice as large, is the same character as the test body it was made from.
-    body = kept["test"][0]
+    body = BodyStore(folder / "bodies" / "test")[0]
     x, y, z = 2 * body.rest.double().T
     lines = [f"v {a} {b} {c}" for a, b, c in torch.stack([x, z, -y], 1).tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (body.faces + 1).tolist()]
     (tmp_path / "own.obj").write_text("\n".join(lines))
     height = float(z.max() - z.min()) / 2
     main([*common, "--mesh", str(tmp_path / "own.obj"), "--y-up", "--height", str(height)])
-    network = ReposeNetwork.from_checkpoint(tmp_path / "njf" / "checkpoints" / "best.ckpt")
+    network = ReposeNetwork.from_checkpoint(folder / "njf" / "checkpoints" / "best.ckpt")
     expected = network.repose(dp.Mesh(body.rest.double(), body.faces), body.poses[:1])[0]
     x, y, z = torch.from_numpy(read_mesh_file(out / "far.obj").vertices).T / 2
     written = torch.stack([x, -z, y], dim=1)

@@ -403,9 +403,13 @@ def uv_card() -> str:
 
 
 def repose_card() -> str:
-    """The card of the shipped weights for poses."""
-    card = json.loads((DOCS.parent / "njf_models" / "weights" / "repose.json").read_text())
-    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {x} |" for name, x in card.items())])
+    """The cards of the shipped weights for poses."""
+    weights = DOCS.parent / "njf_models" / "weights"
+    names = ("repose", "repose-any")
+    cards = [json.loads((weights / f"{name}.json").read_text()) for name in names]
+    lines = [f"| {' | '.join(str(card[row]) for card in cards)} |" for row in cards[0]]
+    rows = [f"| {row} {line}" for row, line in zip(cards[0], lines, strict=True)]
+    return "\n".join([f"| | {' | '.join(f'`{name}`' for name in names)} |", "|---|---|---|", *rows])
 
 
 def notices() -> str:
@@ -478,6 +482,8 @@ def spent_on(cost: dict) -> str:
 def body_tasks() -> str:
     """The other tasks of `examples/body_maps.py`, beside the paper's figures."""
     paper = {  # L2-V, L2-J, L2-N
+        "unpose": None,
+        "unpose-2": None,
         "any-pose": (1.84, 1.55, 4.4),
         "registration": (3.24, 3.01, 9.9),
         "morphing": (2.00, 2.80, 8.2),
@@ -486,16 +492,12 @@ def body_tasks() -> str:
     head = [f"{c}: identity / ours / paper" for c in columns]
     lines = [f"| | from | maps | {' | '.join(head)} | training |", "|---" * 7 + "|"]
     for task, figures in paper.items():
-        path = RESULTS / f"{task}.json"
-        if not path.exists():
-            cells = [f"– / – / {number(x)}" for x in figures]
-            lines.append(f"| {task} | – | – | {' | '.join(cells)} | none yet |")
-            continue
-        results = json.loads(path.read_text())
+        results = json.loads((RESULTS / f"{task}.json").read_text())
         before, after = (results["summary"][name] for name in ("untrained", "ours"))
+        theirs = ["–"] * 3 if figures is None else [number(x) for x in figures]
         cells = [
-            f"{number(before[c])} / {number(after[c])} / {number(x)}"
-            for c, x in zip(columns, figures, strict=True)
+            f"{number(before[c])} / {number(after[c])} / {x}"
+            for c, x in zip(columns, theirs, strict=True)
         ]
         start = "the rest pose" if results["options"]["sources"] == 0 else "any pose"
         spent = spent_on(results["training"]["ours"])

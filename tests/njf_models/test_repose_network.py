@@ -110,8 +110,9 @@ def test_the_network_of_a_checkpoint(tmp_path):
         assert torch.equal(value, saved[f"model.{name}"])
 
 
-def test_the_shipped_weights_are_those_of_their_card():
-    network, about = njf_models.load_pretrained("repose"), card("repose")
+@pytest.mark.parametrize("name", ["repose", "repose-any"])
+def test_the_shipped_weights_are_those_of_their_card(name):
+    network, about = njf_models.load_pretrained(name), card(name)
     assert isinstance(network, ReposeNetwork)
     assert about["parameters"] == sum(p.numel() for p in network.model.parameters())
     assert about["bytes"] < 8e6

@@ -18,6 +18,8 @@ def quiet() -> None:
     """No advertisements and no warnings of Lightning's own doing."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module="lightning.pytorch.utilities._pytree")
+    # Steps that are timed before a training have no trainer to log to.
+    warnings.filterwarnings("ignore", message="You are trying to `self.log\\(\\)`")
 
 
 def circumstances(options: argparse.Namespace) -> dict[str, Any]:

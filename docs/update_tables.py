@@ -530,11 +530,13 @@ def triangulations() -> str:
     results = json.loads((RESULTS / "triangulations.json").read_text())
     ours = results["deviations"].pop("ours")
     head = ["faces", "error, mm", "deviation, mm", "of exact maps, mm", "deviation / own error, %"]
-    head += [f"the same, {name}" for name in results["deviations"]]
+    for name in results["deviations"]:
+        head += [f"error, mm, {name}", f"deviation, mm, {name}"]
     lines = [f"| triangulation | {' | '.join(head)} |", "|---" * (1 + len(head)) + "|"]
     for name, row in ours.items():
         cells = [1000 * row[x] for x in ("error", "deviation", "exact")] + [100 * row["share"]]
-        cells += [100 * others[name]["share"] for others in results["deviations"].values()]
+        for others in results["deviations"].values():
+            cells += [1000 * others[name][x] for x in ("error", "deviation")]
         lines.append(f"| {name} | {row['n_faces']:,} | {' | '.join(map(number, cells))} |")
     about = f"{results['bodies']} unseen bodies in {results['poses']} poses each."
     return "\n".join([*lines, "", about])

@@ -89,12 +89,12 @@ class Recipe(NamedTuple):
     targets: int
     cells: int
     learning_rate: float
-    arguments: dict[str, int] = {}  # noqa: RUF012
+    arguments: dict[str, int]
 
 
 IN_PARTS = Recipe(16, 24, 64, 3e-3, {"parts": 128, "width": 256})
-OF_EACH_FACE = Recipe(8, 8, 100, 2e-3)
-ONE_TARGET = Recipe(32, 1, 128, 2e-3)
+OF_EACH_FACE = Recipe(8, 8, 100, 2e-3, {})
+ONE_TARGET = Recipe(32, 1, 128, 2e-3, {})
 EARLIER = "earlier, cpu seconds"
 WARMUP = 300  # steps; with many parts, a start at the full rate ends in none being used
 

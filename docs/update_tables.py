@@ -450,8 +450,8 @@ def repose() -> str:
             others = [summary[other][name] for other in theirs]
             cells = [summary["untrained"][name], ours, *others, *(x / ours for x in others)]
             lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
-    figures = [paper["ours"], *(paper[name] for name in theirs)]
-    figures += [x / paper["ours"] for x in figures[1:]]
+    figures = [paper["ours"], *(paper.get(name) for name in theirs)]
+    figures += [x and x / paper["ours"] for x in figures[1:]]
     lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(map(number, figures))} |")
     spent = "; ".join(f"{name}: {spent_on(cost)}" for name, cost in costs.items())
     return "\n".join(

@@ -388,16 +388,18 @@ def cost(checkpoint: Path) -> dict[str, float | None]:
     return training_cost(checkpoint) | before
 
 
-def earlier(title: str, options: argparse.Namespace) -> dict[str, float]:
-    """The CPU time of trainings that this one was begun with or comes after, where on record."""
-    seconds = 0.0
+def earlier(title: str, options: argparse.Namespace) -> dict[str, Any]:
+    """The runs this one comes after; CPU time of all trainings before it, where on record."""
+    seconds, counted = 0.0, set()
     for run in [options.init, *options.after]:
-        if run is not None and (run / "results.json").exists():
+        if run is not None and (run / "results.json").exists() and run.name not in counted:
             before = json.loads((run / "results.json").read_text())["training"][title]
             seconds += before["cpu seconds"]
             if run == options.init:
                 seconds += before.get(EARLIER, 0.0)
-    return {EARLIER: seconds} if seconds else {}
+                counted = set(before.get("after", ()))
+    about: dict[str, Any] = {"after": [run.name for run in options.after]} if options.after else {}
+    return about | ({EARLIER: seconds} if seconds else {})
 
 
 def unmoved(options: argparse.Namespace, test: BodyStore) -> list[MapRecord]:

@@ -99,7 +99,7 @@ def test_data_and_training_by_their_commands(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ("nothing", "there are no weights 'nothing', but repose, uv"),
+        ("nothing", "there are no weights 'nothing', but repose, repose-any, uv"),
         ("repose", "the weights 'repose' are not for UV maps; use 'uv'"),
         ("none.ckpt", "there is no file none.ckpt"),
     ],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch.testing import assert_close
@@ -125,7 +123,3 @@ def test_what_is_no_chain_raises():
     cells = Cells(torch.zeros(1, 1, 6), torch.zeros(1, 1, 1, 3, 2), torch.zeros(1, 1, 6))
     with pytest.raises(ValueError, match="on whole shapes"):
         chain.at(cells, torch.zeros(1, 1, POSE_SIZE))
-
-
-def test_a_body_without_carried_poses_is_its_own_source(bodies):
-    assert replace(bodies[0]).carried is None

@@ -92,7 +92,7 @@ class Recipe(NamedTuple):
     arguments: dict[str, int]
 
 
-IN_PARTS = Recipe(16, 24, 64, 3e-3, {"parts": 128, "width": 256})
+IN_PARTS = Recipe(16, 8, 192, 3e-3, {"parts": 128, "octaves": 5})
 OF_EACH_FACE = Recipe(8, 8, 100, 2e-3, {})
 ONE_TARGET = Recipe(32, 1, 128, 2e-3, {})
 EARLIER = "earlier, cpu seconds"
@@ -162,7 +162,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     )
     add("--per-step", type=int, metavar="N", help="bodies per sampled step (the model's)")
     add("--cells", type=int, metavar="N", help="sampled of each (the model's)")
-    add("--code-size", type=int, default=128, help="of PointNet's code (128)")
+    add("--code-size", type=int, default=128, help="of a code (128)")
+    add("--basis", type=int, metavar="N", help="points to see shapes from; 0: PointNet (256)")
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
     add("--models", nargs="+", choices=KINDS, help="which to train (ours, displacement, cages)")
@@ -178,6 +179,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         options = parser.parse_args(argv)
     options.out = options.out or Path("runs") / options.task
     options.carried = min(options.carried, options.poses)
+    if options.basis is None:
+        options.basis = 0 if TASKS[options.task].pieces else 256
     options.models = options.models or ["njf", "displacement", "cages"]
     options.data = options.data or options.out / "bodies"
     return options
@@ -199,7 +202,11 @@ def make_bodies(options: argparse.Namespace) -> list[BodyStore]:
 
 def inputs(options: argparse.Namespace) -> dict[str, int]:
     """What the networks see."""
-    return {"n_points": options.points, "n_energies": options.energies}
+    return {
+        "n_points": options.points,
+        "n_energies": options.energies,
+        "n_basis": options.basis,
+    }
 
 
 def maps_of(
@@ -237,6 +244,7 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
         "face_features": n_features,
         "point_features": n_features,
         "code_size": options.code_size,
+        "basis": options.basis,
         "code_scale": CODE_SCALE,
         **how.arguments,
     }

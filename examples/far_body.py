@@ -98,7 +98,9 @@ def built_in(
     for name, parameters in phenotypes.items():
         body = retriangulated(model, original, replace(near, phenotype=parameters))
         seen = network.inputs
-        maps = BodyMaps([body], n_points=seen.n_points, n_energies=seen.n_energies)
+        maps = BodyMaps(
+            [body], n_points=seen.n_points, n_energies=seen.n_energies, n_basis=seen.n_basis
+        )
         records, emitted = evaluate_maps(network.model, maps)
         table[name] = summarise(records)
         at = median(records)

@@ -84,6 +84,7 @@ def _map(model: Model, body: Body, inputs: Inputs) -> Float[Tensor, "t n 3"]:
         n_targets=len(body.poses),
         n_points=inputs.n_points,
         n_energies=inputs.n_energies,
+        n_basis=inputs.n_basis,
     )
     batch = maps[0]
     return model(batch.shape, encoded(model, batch)).vertices.double()

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
+from njf_models.basis_points import basis_features
 from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.datasets.partial import Partial, cut_pieces
 from njf_models.datasets.poses import reflected
@@ -100,11 +101,13 @@ class BodyMaps(Dataset[Batch]):
         n_targets: how many targets a source has, at most.
         n_points: how many points the encoder sees.
         n_energies: length of the wave-kernel signature that the network sees, 0 for none.
+        n_basis: how many basis points the encoder sees shapes from, instead of points on them.
         resample: draw points, pieces and targets anew at each access (training), or always the
             same (evaluation).
 
     Raises:
-        ValueError: other bodies are asked for, and there is one only.
+        ValueError: other bodies are asked for, and there is one only; or pieces of bodies, seen
+            from basis points.
     """
 
     def __init__(
@@ -115,15 +118,20 @@ class BodyMaps(Dataset[Batch]):
         n_targets: int = 32,
         n_points: int = 1024,
         n_energies: int = 50,
+        n_basis: int = 0,
         resample: bool = False,
     ) -> None:
         self.bodies, self.task, self.resample = bodies, task or Task(), resample
         self.n_targets, self.n_points, self.n_energies = n_targets, n_points, n_energies
+        self.n_basis = n_basis
+        if n_basis and self.task.pieces:
+            raise ValueError("BodyMaps: basis points see whole sources only; use points on them")
         if self.task.others and len(bodies) < 2:
             raise ValueError("BodyMaps: maps to other bodies need two of them at least")
         self._n_poses = len(bodies[0].poses)
         self._body = lru_cache(maxsize=_KEPT_SOURCES)(bodies.__getitem__)  # a store reads files
         self._kept_source = lru_cache(maxsize=_KEPT_SOURCES)(self._make_source)
+        self._basis: dict[tuple[int, int], Tensor] = {}
 
     def __len__(self) -> int:
         return len(self.bodies) * max(1, self.task.sources)
@@ -153,7 +161,10 @@ class BodyMaps(Dataset[Batch]):
     def __getitem__(self, index: int) -> Batch:
         source, targets = self.source(index), self._targets(index)
         vertices = targets.vertices[:, source.kept]
-        points = self._points(source.mesh, source.wks, index)[None]
+        if self.n_basis:
+            points = self.basis_of_source(index)[None]
+        else:
+            points = self._points(source.mesh, source.wks, index)[None]
         return Batch(source.shape, points, vertices, targets.parameters, targets.points)
 
     def surfaces(self, indices: Sequence[int]) -> Surfaces:
@@ -179,19 +190,39 @@ class BodyMaps(Dataset[Batch]):
                 rows[source.kept] = source.wks.float()
         return Surfaces(vertices, faces, present, wks)
 
-    def any_targets(self, n_targets: int) -> Float[Tensor, "1 t n 3"]:
-        """Bodies in poses, drawn at random, as targets of any sources."""
-        bodies = torch.randint(len(self.bodies), (n_targets,)).tolist()
-        poses = torch.randint(self._n_poses, (n_targets,)).tolist()
-        pairs = zip(bodies, poses, strict=True)
-        return torch.stack([self._body(body).posed[pose] for body, pose in pairs])[None]
+    def any_targets(self, n: int) -> tuple[Float[Tensor, "1 t n 3"], Int[Tensor, "1 t 2"]]:
+        """Bodies in poses, drawn at random, as targets of any sources; and which they are."""
+        bodies, poses = torch.randint(len(self.bodies), (n,)), torch.randint(self._n_poses, (n,))
+        numbers = torch.stack([bodies, poses], dim=1)
+        return torch.stack([self._posed(*pair) for pair in numbers.tolist()])[None], numbers[None]
 
-    def own_targets(self, index: int) -> tuple[Float[Tensor, "t n 3"], Float[Tensor, "t p"]]:
-        """Vertices of the targets of a source that are its own body, and their pose parameters."""
-        poses, body = self.targets(index)[:, 1], self._body(index // max(1, self.task.sources))
+    def basis_of_source(self, index: int) -> Float[Tensor, "pairs 8"]:
+        """What basis points see of a source; kept, since nothing of it is drawn."""
+        if (index, -2) not in self._basis:
+            self._basis[index, -2] = self._seen_by_basis(self._vertices(index))
+        return self._basis[index, -2]
+
+    def basis_of_target(self, body: int, pose: int) -> Float[Tensor, "pairs 8"]:
+        """What basis points see of a target; kept."""
+        if (body, pose) not in self._basis:
+            self._basis[body, pose] = self._seen_by_basis(self._posed(body, pose))
+        return self._basis[body, pose]
+
+    def own_targets(
+        self, index: int
+    ) -> tuple[Float[Tensor, "t n 3"], Float[Tensor, "t p"], Int[Tensor, "t 2"]]:
+        """Targets of a source that are its own body: vertices, parameters, and which they are."""
+        numbers, body = self.targets(index), self._body(index // max(1, self.task.sources))
         if self.task.told == "nothing":
-            return body.rest[None], torch.zeros(1, 0)
-        return body.posed[poses], body.poses[poses]
+            return body.rest[None], torch.zeros(1, 0), numbers
+        poses = numbers[:, 1]
+        return body.posed[poses], body.poses[poses], numbers
+
+    def _posed(self, body: int, pose: int) -> Float[Tensor, "n 3"]:
+        return self._body(body).posed[pose]
+
+    def _seen_by_basis(self, vertices: Float[Tensor, "n 3"]) -> Float[Tensor, "pairs 8"]:
+        return basis_features(dp.Mesh(vertices, self._body(0).faces), self.n_basis)
 
     def _vertices(self, index: int) -> Float[Tensor, "n 3"]:
         """Of the whole body that is a source, where networks took it to if they did."""
@@ -219,6 +250,9 @@ class BodyMaps(Dataset[Batch]):
         if self.task.told == "pose":
             parameters = torch.stack([bodies[body].poses[pose] for body, pose in numbers])
             return _Targets(vertices, parameters, None)
+        if self.n_basis:
+            seen = torch.stack([self.basis_of_target(*pair) for pair in numbers])
+            return _Targets(vertices, None, seen)
         meshes = [dp.Mesh(x.double(), bodies[numbers[0][0]].faces) for x in vertices]
         points = [self._points(mesh, self._wks(mesh), index) for mesh in meshes]
         return _Targets(vertices, None, torch.stack(points))
@@ -257,18 +291,26 @@ class CellSampler:
         maps, task = self.maps, self.maps.task
         surfaces = maps.surfaces(indices)
         signs = 1 - 2 * torch.randint(2, (1 if task.others else len(indices),)).float()
-        code: dict[str, Tensor] = {"points": surfaces.points(maps.n_points)}
+        code: dict[str, Any] = {"basis": maps.n_basis > 0}
+        if maps.n_basis:
+            code["points"] = torch.stack([maps.basis_of_source(index) for index in indices])
+        else:
+            code["points"] = surfaces.points(maps.n_points)
         if task.others:
-            targets = maps.any_targets(maps.n_targets)
+            targets, numbers = maps.any_targets(maps.n_targets)
         else:
             own = [maps.own_targets(index) for index in indices]
-            targets = torch.stack([vertices for vertices, _ in own])
+            targets, poses, numbers = (torch.stack(of_each) for of_each in zip(*own, strict=True))
             if task.told == "pose":
-                poses = torch.stack([parameters for _, parameters in own])
                 code["parameters"] = reflected(poses).where(signs[:, None, None] < 0, poses)
         if task.told == "points":
-            code["target_points"] = self._points(targets)
+            seen = self._seen_by_basis(numbers) if maps.n_basis else self._points(targets)
+            code["target_points"] = seen
         return Cells.draw(self.kind, self.n_cells, surfaces, targets, **code).reflected(signs)
+
+    def _seen_by_basis(self, numbers: Int[Tensor, "b t 2"]) -> Float[Tensor, "b t pairs 8"]:
+        seen = [self.maps.basis_of_target(*pair) for pair in numbers.flatten(0, 1).tolist()]
+        return torch.stack(seen).unflatten(0, numbers.shape[:2])
 
     def _points(self, targets: Float[Tensor, "b t n 3"]) -> Float[Tensor, "b t s f"]:
         """What the encoder sees of the targets."""

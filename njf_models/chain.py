@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import diffpoisson as dp
+from njf_models.basis_points import basis_features
 from njf_models.features import Shape, face_features, point_features
 from njf_models.field import PartField
 from njf_models.njf import NeuralJacobianField, Prediction
@@ -82,7 +83,7 @@ class ChainedNJF(WholeShapes, nn.Module):
 
     Args:
         links: arguments of each `NeuralJacobianField`, of one round.
-        n_points: how many points their encoders see.
+        n_points: how many points their encoders see, where they are PointNets.
     """
 
     output_dim = 3
@@ -142,7 +143,10 @@ class ChainedNJF(WholeShapes, nn.Module):
             assert isinstance(link, NeuralJacobianField)
             mesh = shape.mesh.with_vertices(vertices.to(shape.mesh.dtype))
             dtype = shape.features.dtype
-            points = point_features(mesh, samples).to(dtype)
+            if link.n_basis:
+                points = basis_features(mesh, link.n_basis).to(dtype)
+            else:
+                points = point_features(mesh, samples).to(dtype)
             start = Start.of(link, vertices, J, face_features(mesh).to(dtype), points)
             if link is not self.last:
                 vertices = start.finish(link, shape, start.code.new_zeros(0)).vertices

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from njf_models.basis_points import BasisEncoder
 from njf_models.pointnet import PointNet
 from njf_models.rotation_vectors import rotation_matrices
 
@@ -21,10 +22,13 @@ class CodedModel(nn.Module):
         parameters: number of user parameters appended to the code.
         rotations: whether the parameters are rotation vectors, whose matrices the code has too: a
             chain of joints multiplies matrices, and vectors say so only after an exponential.
+        basis: how many basis points the encoder sees a shape from, instead of points on it, which
+            PointNet sees; 0 for PointNet.
         code_scale: factor of what the encoder makes. Its entries are largest values of many points,
             so that all shapes have much in common, and parameters in radians are small beside them.
 
     Attributes:
+        n_basis: as `basis`.
         code_size: size z of the whole code.
         source_size: how many of its entries are of the source alone; they come first.
     """
@@ -37,6 +41,7 @@ class CodedModel(nn.Module):
         code_size: int,
         parameters: int,
         rotations: bool = False,
+        basis: int = 0,
         code_scale: float = 1.0,
     ) -> None:
         super().__init__()
@@ -45,8 +50,12 @@ class CodedModel(nn.Module):
                 f"rotations are vectors of three parameters each, got {parameters} parameters"
             )
         self.encodes_target, self.rotations = encodes_target, rotations
-        self.code_scale = code_scale
-        self.encoder = PointNet(point_features, code_size) if point_features else None
+        self.n_basis, self.code_scale = basis, code_scale
+        self.encoder: PointNet | BasisEncoder | None = None
+        if point_features:
+            self.encoder = (
+                BasisEncoder(basis, code_size) if basis else PointNet(point_features, code_size)
+            )
         n_codes = (1 + encodes_target) if point_features else 0
         self.source_size = code_size if point_features else 0
         self.code_size = n_codes * code_size + (4 if rotations else 1) * parameters
@@ -57,13 +66,14 @@ class CodedModel(nn.Module):
         target: Float[Tensor, "*#batch t f"] | None = None,
         parameters: Float[Tensor, "*#batch p"] | None = None,
     ) -> Float[Tensor, "*batch z"]:
-        """The global code: PointNet of source and target, and user parameters, side by side.
+        """The global code: what the encoder makes of source and target, and user parameters.
 
         One source, encoded once, serves a batch of targets or parameters; so do several, each its
         own, where an axis of size one stands for its targets.
 
         Args:
-            source: (…, s, f) point features of the sources, if the model has an encoder.
+            source: (…, s, f) what the encoder sees of the sources, if the model has one: points on
+                them, or basis points.
             target: (…, t, f) point features of the targets, if it encodes them.
             parameters: (…, p) user parameters, if it has any.
         """

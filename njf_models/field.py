@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
+
+from njf_models.layers import smooth_layers
+from njf_models.products import MatrixProducts
 
 # A large batch goes through the layers so many rows at a time: in memory that the allocator reuses.
 # Of larger arrays it returns every one to the system, and page faults cost as much as the layers.
@@ -125,6 +127,10 @@ class PartField(nn.Module):
     costs a product of two small arrays. Some weights are shares, which sum to one at each face, as
     of bones; others may be anything, for what happens between the bones.
 
+    Weights change quickly over a surface, as at the armpits, which a network of positions is slow
+    to learn; so w may see waves of the positions, too (Tancik et al. 2020). And where a code tells
+    rotations, M has products of them (`products.MatrixProducts`) beside what the network adds.
+
     Args:
         code_size: size of the global code, of which the source's part comes first.
         source_size: size of the source's part.
@@ -132,6 +138,9 @@ class PartField(nn.Module):
         out_features: number of outputs per face, the entries of its matrix.
         parts: number of matrices, a quarter of which have shares for weights.
         width: size of the hidden layers of w; those of M are half as wide again.
+        octaves: how many waves of each coordinate w sees, the first of which is 2 units long, each
+            other half as long as the one before.
+        rotations: how many 3×3 matrices less the identity end the code.
     """
 
     def __init__(
@@ -143,21 +152,26 @@ class PartField(nn.Module):
         *,
         parts: int = 128,
         width: int = 128,
+        octaves: int = 0,
+        rotations: int = 0,
     ) -> None:
         super().__init__()
         if parts % 4:
             raise ValueError(f"PartField: the number of parts must be a multiple of 4, got {parts}")
         self.source_size, self.out_features = source_size, out_features
         self.shares = parts // 4
-        self.of_face = FieldMLP(source_size, in_features, parts, width)
+        self.octaves, self.rotations = octaves, rotations
+        self.of_face = FieldMLP(source_size, in_features + 6 * octaves, parts, width)
         last = self.of_face.layers[-1]
         assert isinstance(last, nn.Linear)
         nn.init.normal_(last.weight, std=width**-0.5)  # not zero, or no part would differ
-        self.of_code = _smooth((code_size, *[3 * width // 2] * 3, parts * out_features))
+        self.of_code = smooth_layers((code_size, *[3 * width // 2] * 3, parts * out_features))
         last = self.of_code[-1]
         assert isinstance(last, nn.Linear)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
+        if rotations:
+            self.of_rotations = MatrixProducts(rotations, parts, out_features // 3)
 
     def forward(
         self,
@@ -196,13 +210,21 @@ class PartField(nn.Module):
         part_of_face: Int[Tensor, "m"] | None = None,
     ) -> Float[Tensor, "*any k"]:
         """w of each face; arguments as of `FieldMLP`, but the source's part of the codes only."""
-        w = self.of_face(features, source, part_of_face)
+        x = features[..., :3]
+        waves = [
+            f(torch.pi * 2**k * x) for k in range(self.octaves) for f in (torch.sin, torch.cos)
+        ]
+        w = self.of_face(torch.cat([features, *waves], dim=-1), source, part_of_face)
         shares, others = w.split((self.shares, w.shape[-1] - self.shares), dim=-1)
         return torch.cat([(_SHARPNESS * shares).softmax(-1), others], dim=-1)
 
     def parts(self, code: Float[Tensor, "*batch z"]) -> Float[Tensor, "*batch k out"]:
         """M of each map."""
-        M = self.of_code(code.reshape(-1, code.shape[-1]))
+        codes = code.reshape(-1, code.shape[-1])
+        M = self.of_code(codes)
+        if self.rotations:
+            told = codes[:, -9 * self.rotations :].unflatten(-1, (-1, 3, 3))
+            M = M + self.of_rotations(told).reshape(M.shape)
         return M.view(*code.shape[:-1], -1, self.out_features)
 
     def _one_source(self, sources: Float[Tensor, "*b t z"]) -> Float[Tensor, "*b z"]:
@@ -213,22 +235,3 @@ class PartField(nn.Module):
                 "shape once, for all of its maps"
             )
         return first.squeeze(-2)
-
-
-def layered(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Linear layers with the norms and activations of `FieldMLP` between."""
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in itertools.pairwise(sizes[:-1]):
-        layers += [nn.Linear(fan_in, fan_out), nn.GroupNorm(4, fan_out), nn.ReLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
-
-
-def _smooth(sizes: tuple[int, ...]) -> nn.Sequential:
-    """Linear layers for a smooth function of a code: with ReLU, poses end up half as far again off.
-
-    Each hidden layer is normed as a whole.
-    """
-    layers: list[nn.Module] = []
-    for fan_in, fan_out in itertools.pairwise(sizes[:-1]):
-        layers += [nn.Linear(fan_in, fan_out), nn.LayerNorm(fan_out), nn.SiLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))

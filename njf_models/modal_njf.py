@@ -20,8 +20,8 @@ import diffpoisson as dp
 from diffpoisson.arguments import require_integer
 from njf_models.encoding import CodedModel
 from njf_models.features import Shape
-from njf_models.field import layered
 from njf_models.handles import Handles
+from njf_models.layers import layered
 from njf_models.njf import Prediction
 from njf_models.sampled import WholeShapes
 

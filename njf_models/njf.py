@@ -57,7 +57,8 @@ class NeuralJacobianField(CodedModel):
             paper), or its plain mean over vertices is zero (the authors' experiments).
         width: size of the field's hidden layers.
         parts: make the first field a `field.PartField` of so many parts; 0 for the paper's MLP.
-        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
+        octaves: of a `field.PartField`.
+        coding: `rotations`, `basis` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "faces"
@@ -77,6 +78,7 @@ class NeuralJacobianField(CodedModel):
         width: int = 128,
         local_step: bool = False,
         parts: int = 0,
+        octaves: int = 0,
         **coding: Any,
     ) -> None:
         super().__init__(
@@ -103,6 +105,8 @@ class NeuralJacobianField(CodedModel):
                 entries,
                 parts=parts,
                 width=width,
+                octaves=octaves,
+                rotations=parameters // 3 if self.rotations else 0,
             )
         else:
             self.field = FieldMLP(self.code_size, face_features, entries, width)

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from njf_models.basis_points import reflected_basis
+
 CellKind = Literal["faces", "vertices"]
 
 
@@ -25,11 +27,13 @@ class Cells:
     Attributes:
         features: (b, k, f) features of the cells, faces or vertices.
         target: (b, t, k, c, 2) Jacobians of faces, or (b, t, k, c) images of vertices.
-        points: (b, s, f) point features of the sources, for the encoder.
+        points: (b, s, f) what the encoder sees of the sources: features of points on them, or of
+            basis points.
         frames: (b, k, 3, 2) tangent bases of faces; None for vertices.
-        target_points: (b, t, s, f) point features of the targets, if the code is made from them;
+        target_points: (b, t, s, f) the same of the targets, if the code is made from them;
             (1, t, s, f) if all shapes have the same targets.
         parameters: (b, t, p) parameters of the targets, if they have any.
+        basis: whether the points are basis points.
     """
 
     features: Float[Tensor, "b k f"]
@@ -38,6 +42,7 @@ class Cells:
     frames: Float[Tensor, "b k 3 2"] | None = None
     target_points: Float[Tensor, "#b t s f"] | None = None
     parameters: Float[Tensor, "b t p"] | None = None
+    basis: bool = False
 
     @classmethod
     def draw(
@@ -56,7 +61,7 @@ class Cells:
             n_cells: how many of each.
             surfaces: the sources.
             targets: images of their vertices; (1, t, n, 3) if the same for all.
-            code: `points`, and `target_points` and `parameters` if there are any.
+            code: `points`, and `target_points`, `parameters` and `basis` if there are any.
         """
         return (_faces if kind == "faces" else _vertices)(n_cells, surfaces, targets, code)
 
@@ -74,14 +79,21 @@ class Cells:
             x, n, rest = features.split((3, 3, features.shape[-1] - 6), dim=-1)
             return torch.cat([x * axes.view(shape), n * axes.view(shape), rest], dim=-1)
 
+        def seen(points: Tensor) -> Tensor:
+            """What the encoder sees."""
+            if not self.basis:
+                return moved(points)
+            mirrored = signs.view(-1, *[1] * (points.ndim - 1)) < 0
+            return reflected_basis(points).where(mirrored, points)
+
         rows = axes.view(-1, 1, 1, 3)
         return replace(
             self,
             features=moved(self.features),
-            points=moved(self.points),
+            points=seen(self.points),
             target=self.target * (rows if self.frames is None else rows[..., None]),
             frames=None if self.frames is None else self.frames * axes[:, None, :, None],
-            target_points=None if self.target_points is None else moved(self.target_points),
+            target_points=None if self.target_points is None else seen(self.target_points),
         )
 
 

@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import diffpoisson as dp
+from njf_models.basis_points import basis_features
 from njf_models.features import Shape, point_features
 from njf_models.models import MODELS
 
@@ -28,23 +29,28 @@ class Inputs:
         n_points: number of surface points for the encoder.
         n_energies: length of the wave-kernel signature, 0 for none.
         n_eigenpairs: of the spectrum, for networks that diffuse, 0 for none.
+        n_basis: how many basis points the encoder sees a shape from, instead of points on it.
     """
 
     n_points: int = 1024
     n_energies: int = 0
     n_eigenpairs: int = 0
+    n_basis: int = 0
 
     def of(self, mesh: dp.Mesh) -> tuple[Shape, Float[Tensor, "s f"]]:
-        """A mesh prepared for the network, and the points of it that the encoder sees, float32.
+        """A mesh prepared for the network, and what the encoder sees of it, float32.
 
         The same at every call. A mesh of fewer vertices than `n_eigenpairs` has all of its own.
         """
         solver, wks = dp.PoissonSolver(mesh), None
         if self.n_energies:
             wks = dp.wave_kernel_signature(mesh, self.n_energies, solver=solver)
-        generator = torch.Generator().manual_seed(0)
-        samples = dp.sample_surface(mesh, self.n_points, generator=generator)
-        points = point_features(mesh, samples, wks).float()
+        if self.n_basis:
+            points = basis_features(mesh, self.n_basis).float()
+        else:
+            generator = torch.Generator().manual_seed(0)
+            samples = dp.sample_surface(mesh, self.n_points, generator=generator)
+            points = point_features(mesh, samples, wks).float()
         n_eigenpairs = min(self.n_eigenpairs, mesh.n_vertices)
         return Shape.prepare(mesh, wks, solver=solver, n_eigenpairs=n_eigenpairs), points
 

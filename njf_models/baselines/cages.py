@@ -44,7 +44,7 @@ class CageDeformation(WholeShapes, CodedModel):
         centering: see `NeuralJacobianField`.
         width: size of the hidden layers.
         cage_faces: number of faces of a cage.
-        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
+        coding: `rotations`, `basis` and `code_scale` of `encoding.CodedModel`.
     """
 
     output_dim = 3

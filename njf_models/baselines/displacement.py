@@ -28,7 +28,8 @@ class DisplacementField(CodedModel):
         centering: see `NeuralJacobianField`.
         width: size of the hidden layers.
         parts: as of `NeuralJacobianField`, to tell what its field alone brings.
-        coding: `rotations` and `code_scale` of `encoding.CodedModel`.
+        octaves: of a `field.PartField`.
+        coding: `rotations`, `basis` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "vertices"
@@ -45,6 +46,7 @@ class DisplacementField(CodedModel):
         centering: Centering = "area",
         width: int = 128,
         parts: int = 0,
+        octaves: int = 0,
         **coding: Any,
     ) -> None:
         super().__init__(
@@ -64,6 +66,8 @@ class DisplacementField(CodedModel):
                 output_dim,
                 parts=parts,
                 width=width,
+                octaves=octaves,
+                rotations=parameters // 3 if self.rotations else 0,
             )
         else:
             self.field = FieldMLP(self.code_size, face_features, output_dim, width)

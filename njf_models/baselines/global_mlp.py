@@ -9,7 +9,7 @@ from torch import Tensor, nn
 import diffpoisson as dp
 from njf_models.encoding import CodedModel
 from njf_models.features import Shape
-from njf_models.field import layered
+from njf_models.layers import layered
 from njf_models.njf import Centering, Prediction, centre_vertices
 from njf_models.sampled import WholeShapes
 

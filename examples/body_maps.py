@@ -3,8 +3,9 @@
 `--task repose`: from the rest pose to pose parameters; `unpose`: from any pose to rest; `any-pose`:
 from any pose to pose parameters; `registration`: a body with pieces cut away onto points of the
 same body in another pose; `morphing`: a body in any pose onto points of another body in any pose.
-With `--after RUN ...` the maps are a chain: they start from where the networks of other folders,
-trained to unpose, take the bodies.
+`--pose RUN` tells networks the pose that `examples/body_pose.py` reads off a source that is taken
+to rest, or off the target of morphing. With `--after RUN ...` the maps are a chain: they start from
+where the networks of other folders, trained to unpose, take the bodies.
 
 Random bodies → poses inside joint limits → training → evaluation on bodies and poses that were
 never seen. Training has two phases, one optimizer and one schedule: first on random faces of
@@ -52,10 +53,12 @@ from njf_models.body_report import BodyRow, save_body_report
 from njf_models.carried import carry
 from njf_models.chain import ChainedNJF
 from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
+from njf_models.datasets.poses import JOINTS
 from njf_models.evaluation import format_table
 from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.map_errors import summarise
 from njf_models.models import MODELS
+from njf_models.pose_training import PoseTraining
 from njf_models.training import (
     NJFTraining,
     Phase,
@@ -163,8 +166,11 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--per-step", type=int, metavar="N", help="bodies per sampled step (the model's)")
     add("--cells", type=int, metavar="N", help="sampled of each (the model's)")
     add("--code-size", type=int, default=128, help="of a code (128)")
-    add("--basis", type=int, metavar="N", help="points to see shapes from; 0: PointNet (256)")
+    add(
+        "--basis", type=int, metavar="N", help="points to see shapes from; 0: PointNet (256; RUN's)"
+    )
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
+    add("--pose", type=Path, metavar="RUN", help="of body_pose.py: read poses off shapes")
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
     add("--models", nargs="+", choices=KINDS, help="which to train (ours, displacement, cages)")
     add("--validations", type=int, default=10, metavar="N", help="in a training (10)")
@@ -179,7 +185,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         options = parser.parse_args(argv)
     options.out = options.out or Path("runs") / options.task
     options.carried = min(options.carried, options.poses)
-    if options.basis is None:
+    if options.pose is not None:
+        options.basis = pose_training(options).hparams["estimator"]["basis"]
+    elif options.basis is None:
         options.basis = 0 if TASKS[options.task].pieces else 256
     options.models = options.models or ["njf", "displacement", "cages"]
     options.data = options.data or options.out / "bodies"
@@ -253,7 +261,9 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
         model |= {"parameters": POSE_SIZE, "rotations": True}
     elif told == "points":
         model["encodes_target"] = True
-    return NJFTraining(
+    if options.pose is not None:
+        model["joints"] = len(JOINTS)
+    module = NJFTraining(
         model,
         learning_rate=how.learning_rate,
         steps=steps,
@@ -261,6 +271,15 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
         inputs=inputs(options),
         kind=kind.removesuffix("-parts"),
     )
+    if options.pose is not None:
+        estimator = pose_training(options).estimator
+        module.model.estimator.load_state_dict(estimator.state_dict())
+    return module
+
+
+def pose_training(options: argparse.Namespace) -> PoseTraining:
+    """Of the folder of `--pose`."""
+    return PoseTraining.load_from_checkpoint(options.pose / "checkpoints" / "best.ckpt")
 
 
 def loaders(

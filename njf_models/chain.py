@@ -47,10 +47,10 @@ class Start(NamedTuple):
         vertices: Float[Tensor, "n 3"],
         jacobians: Float[Tensor, "m 3 2"],
         features: Float[Tensor, "m f"],
-        points: Float[Tensor, "s f"],
+        points: Float[Tensor, "s g"],
     ) -> Start:
         """A network's start, a constant, from the points that its encoder sees there."""
-        code = network.encode_shape(points[None])[0]
+        code = network.encode_source(points[None])[0]
         field = network.field
         weights = field.weights(features, code) if isinstance(field, PartField) else None
         return cls(vertices, jacobians, features, code, weights)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from njf_models.basis_points import BasisEncoder
 from njf_models.pointnet import PointNet
+from njf_models.pose_estimator import PoseEstimator
 from njf_models.rotation_vectors import rotation_matrices
 
 
@@ -24,6 +25,8 @@ class CodedModel(nn.Module):
             chain of joints multiplies matrices, and vectors say so only after an exponential.
         basis: how many basis points the encoder sees a shape from, instead of points on it, which
             PointNet sees; 0 for PointNet.
+        joints: how many rotations a `pose_estimator.PoseEstimator` reads off a shape, from the same
+            basis points; the code has them, too. Training leaves it as it is. 0 for none.
         code_scale: factor of what the encoder makes. Its entries are largest values of many points,
             so that all shapes have much in common, and parameters in radians are small beside them.
 
@@ -31,6 +34,9 @@ class CodedModel(nn.Module):
         n_basis: as `basis`.
         code_size: size z of the whole code.
         source_size: how many of its entries are of the source alone; they come first.
+        n_matrices: how many matrices less the identity end the code, of rotations: parameters; or
+            the target's estimated ones; or the source's, and their inverses, for maps that are
+            told nothing.
     """
 
     def __init__(
@@ -42,6 +48,7 @@ class CodedModel(nn.Module):
         parameters: int,
         rotations: bool = False,
         basis: int = 0,
+        joints: int = 0,
         code_scale: float = 1.0,
     ) -> None:
         super().__init__()
@@ -56,9 +63,20 @@ class CodedModel(nn.Module):
             self.encoder = (
                 BasisEncoder(basis, code_size) if basis else PointNet(point_features, code_size)
             )
-        n_codes = (1 + encodes_target) if point_features else 0
-        self.source_size = code_size if point_features else 0
-        self.code_size = n_codes * code_size + (4 if rotations else 1) * parameters
+        if joints and (parameters or not (point_features and basis)):
+            raise ValueError(
+                "joints are estimated from basis points, where no parameters tell them; "
+                f"got basis={basis}, parameters={parameters}, point_features={point_features}"
+            )
+        self.estimator = PoseEstimator(basis, joints).requires_grad_(False) if joints else None
+        of_shape = code_size if point_features else 0
+        of_source = 0 if encodes_target else 18 * joints
+        told = (4 if rotations else 1) * parameters
+        if encodes_target:
+            told += of_shape + 9 * joints
+        self.source_size = of_shape + of_source
+        self.code_size = self.source_size + told
+        self.n_matrices = of_source // 9 or joints or (parameters // 3 if rotations else 0)
 
     def encode(
         self,
@@ -83,8 +101,9 @@ class CodedModel(nn.Module):
             raise ValueError(
                 f"encode: this model encodes {expected} point cloud(s), got {len(clouds)}"
             )
-        codes = [self.encode_shape(cloud) for cloud in clouds]
-        codes += [] if parameters is None else [self._with_matrices(parameters)]
+        codes = [] if source is None else [self.encode_source(source)]
+        if target is not None or parameters is not None:
+            codes.append(self.told(target, parameters))
         batch = torch.broadcast_shapes(*(code.shape[:-1] for code in codes))
         code = torch.cat([code.expand(*batch, -1) for code in codes], dim=-1)
         if code.shape[-1] != self.code_size:
@@ -105,19 +124,29 @@ class CodedModel(nn.Module):
             target: (…, t, f) point features.
             parameters: (…, p) user parameters.
         """
-        codes = [] if target is None else [self.encode_shape(target)]
+        codes = [] if target is None else [self._encoded(target)]
+        if target is not None and self.estimator is not None:
+            codes.append(self.estimator(target).flatten(-3))
         codes += [] if parameters is None else [self._with_matrices(parameters)]
         batch = torch.broadcast_shapes(*(code.shape[:-1] for code in codes))
         return torch.cat([code.expand(*batch, -1) for code in codes], dim=-1)
 
-    def encode_shape(self, points: Float[Tensor, "*batch s f"]) -> Float[Tensor, "*batch k"]:
-        """The code of a shape, source or target, from points on it.
+    def encode_source(self, points: Float[Tensor, "*batch s f"]) -> Float[Tensor, "*batch k"]:
+        """What the code has of a source, from what the encoder sees of it.
 
         Raises:
             ValueError: the model has no encoder.
         """
+        code = self._encoded(points)
+        if self.estimator is None or self.encodes_target:
+            return code
+        offsets = self.estimator(points)
+        inverses = offsets.mT  # of rotations, and of estimates what a field makes of them
+        return torch.cat([code, torch.cat([offsets, inverses], dim=-3).flatten(-3)], dim=-1)
+
+    def _encoded(self, points: Float[Tensor, "*batch s f"]) -> Float[Tensor, "*batch k"]:
         if self.encoder is None:
-            raise ValueError("encode_shape: this model encodes no shapes")
+            raise ValueError("encode_source: this model encodes no shapes")
         code = self.encoder(points)
         return code if self.code_scale == 1 else self.code_scale * code
 

@@ -58,7 +58,7 @@ class NeuralJacobianField(CodedModel):
         width: size of the field's hidden layers.
         parts: make the first field a `field.PartField` of so many parts; 0 for the paper's MLP.
         octaves: of a `field.PartField`.
-        coding: `rotations`, `basis` and `code_scale` of `encoding.CodedModel`.
+        coding: `rotations`, `basis`, `joints` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "faces"
@@ -106,7 +106,7 @@ class NeuralJacobianField(CodedModel):
                 parts=parts,
                 width=width,
                 octaves=octaves,
-                rotations=parameters // 3 if self.rotations else 0,
+                rotations=self.n_matrices,
             )
         else:
             self.field = FieldMLP(self.code_size, face_features, entries, width)

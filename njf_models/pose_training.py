@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import lightning
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,10 +14,10 @@ from njf_models.datasets.poses import JOINTS, reflected
 from njf_models.datasets.seen_poses import SeenPoses
 from njf_models.pose_estimator import PoseEstimator, angles_between
 from njf_models.rotation_vectors import rotation_matrices
-from njf_models.training import rate_share
+from njf_models.training import TimedModule, rate_share
 
 
-class PoseTraining(lightning.LightningModule):
+class PoseTraining(TimedModule):
     """Mean squares of the matrices' entries, with Adam and a cosine.
 
     Half of the bodies of a step are mirrored, with their poses.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -74,14 +75,14 @@ class ReposeNetwork(TrainedNetwork):
             checkpoints: all but the last of networks that take bodies nearer to rest.
 
         Raises:
-            ValueError: their encoders see different numbers of points.
+            ValueError: their inputs differ, but for how many basis points they are seen from.
         """
         links = [cls.from_checkpoint(path) for path in checkpoints]
         if len(links) == 1:
             return links[0]
-        if len({link.inputs for link in links}) != 1:
+        if len({replace(link.inputs, n_basis=0) for link in links}) != 1:
             raise ValueError(f"ReposeNetwork.chained: inputs of {checkpoints} differ")
-        inputs = links[0].inputs
+        inputs = links[-1].inputs
         arguments = {"links": [link.arguments for link in links], "n_points": inputs.n_points}
         network = cls(arguments, inputs, "chain")
         chain = ChainedNJF.of([link._last for link in links], inputs.n_points)

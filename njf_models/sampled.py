@@ -27,20 +27,20 @@ class Cells:
     Attributes:
         features: (b, k, f) features of the cells, faces or vertices.
         target: (b, t, k, c, 2) Jacobians of faces, or (b, t, k, c) images of vertices.
-        points: (b, s, f) what the encoder sees of the sources: features of points on them, or of
+        points: (b, s, g) what the encoder sees of the sources: features of points on them, or of
             basis points.
         frames: (b, k, 3, 2) tangent bases of faces; None for vertices.
-        target_points: (b, t, s, f) the same of the targets, if the code is made from them;
-            (1, t, s, f) if all shapes have the same targets.
+        target_points: (b, t, s, g) the same of the targets, if the code is made from them;
+            (1, t, s, g) if all shapes have the same targets.
         parameters: (b, t, p) parameters of the targets, if they have any.
         basis: whether the points are basis points.
     """
 
     features: Float[Tensor, "b k f"]
     target: Float[Tensor, "b t k *c"]
-    points: Float[Tensor, "b s f"]
+    points: Float[Tensor, "b s g"]
     frames: Float[Tensor, "b k 3 2"] | None = None
-    target_points: Float[Tensor, "#b t s f"] | None = None
+    target_points: Float[Tensor, "#b t s g"] | None = None
     parameters: Float[Tensor, "b t p"] | None = None
     basis: bool = False
 

@@ -222,7 +222,48 @@ def rate_share(step: int, steps: int, warmup: int) -> float:
     return rise * (1 + math.cos(math.pi * step / steps)) / 2
 
 
-class NJFTraining(lightning.LightningModule):
+class TimedModule(lightning.LightningModule):
+    """A training that knows how long it has taken.
+
+    Checkpoints record `training_seconds` and `cpu_seconds`, over all runs, validations included;
+    None where an earlier run did not record its own.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._wall, self._cpu = _Stopwatch(time.perf_counter), _Stopwatch(time.process_time)
+
+    @property
+    def training_seconds(self) -> float | None:
+        """Wall time of training until now, over all runs; None if some did not record theirs."""
+        return self._wall.seconds
+
+    @property
+    def cpu_seconds(self) -> float | None:
+        """The same of this process's CPU time, which does not depend on what else runs."""
+        return self._cpu.seconds
+
+    def on_train_start(self) -> None:
+        """The clocks start."""
+        self._wall.start()
+        self._cpu.start()
+
+    def on_train_end(self) -> None:
+        """The clocks stop."""
+        self._wall.stop()
+        self._cpu.stop()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Record the times."""
+        checkpoint |= {"training_seconds": self._wall.seconds, "cpu_seconds": self._cpu.seconds}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on counting."""
+        self._wall.earlier = checkpoint.get("training_seconds")
+        self._cpu.earlier = checkpoint.get("cpu_seconds")
+
+
+class NJFTraining(TimedModule):
     """Training with Adam, by the paper's schedule or by a cosine.
 
     Args:
@@ -234,9 +275,6 @@ class NJFTraining(lightning.LightningModule):
         warmup: and rise to it in so many.
         inputs: fields of `trained.Inputs`, what the network sees, for the record.
         kind: one of `models.MODELS`: Neural Jacobian Fields, or a baseline.
-
-    Checkpoints record `training_seconds` and `cpu_seconds`, over all runs, validations included;
-    None where an earlier run did not record its own.
     """
 
     def __init__(
@@ -261,7 +299,6 @@ class NJFTraining(lightning.LightningModule):
             raise ValueError("NJFTraining: augment turns planar maps; set output_dim=2 or leave it")
         self.learning_rate, self.patience = learning_rate, patience
         self.steps, self.warmup = steps, warmup
-        self._wall, self._cpu = _Stopwatch(time.perf_counter), _Stopwatch(time.process_time)
 
     def training_step(self, batch: Batch | Cells, batch_idx: int) -> Tensor:
         """Loss of one packed batch, averaged over the rounds; or of samples of several shapes."""
@@ -304,35 +341,6 @@ class NJFTraining(lightning.LightningModule):
 
     def _iterates(self, batch: Batch) -> list[Prediction]:
         return self.model.iterates(batch.shape, encoded(self.model, batch))
-
-    @property
-    def training_seconds(self) -> float | None:
-        """Wall time of training until now, over all runs; None if some did not record theirs."""
-        return self._wall.seconds
-
-    @property
-    def cpu_seconds(self) -> float | None:
-        """The same of this process's CPU time, which does not depend on what else runs."""
-        return self._cpu.seconds
-
-    def on_train_start(self) -> None:
-        """The clocks start."""
-        self._wall.start()
-        self._cpu.start()
-
-    def on_train_end(self) -> None:
-        """The clocks stop."""
-        self._wall.stop()
-        self._cpu.stop()
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Record the times."""
-        checkpoint |= {"training_seconds": self._wall.seconds, "cpu_seconds": self._cpu.seconds}
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on counting."""
-        self._wall.earlier = checkpoint.get("training_seconds")
-        self._cpu.earlier = checkpoint.get("cpu_seconds")
 
     def configure_optimizers(self) -> Any:
         """Adam and the schedule of its rate."""

@@ -14,6 +14,7 @@ import trimesh
 
 import diffpoisson as dp
 from njf_models.datasets.bodies import BodyStore
+from njf_models.datasets.seen_poses import build_seen_poses
 from njf_models.meshfiles import read_mesh_file
 from njf_models.repose_network import ReposeNetwork
 from njf_models.uv_network import UVNetwork
@@ -82,9 +83,35 @@ def test_bodies(bodies_run):
     assert (folder / "results.png").stat().st_size > 50_000
 
 
+@pytest.fixture(scope="module", name="pose_run")
+def poses_read_off_bodies(tmp_path_factory):
+    """A folder of `body_pose.py`, trained for seconds, and its mean errors."""
+    folder = tmp_path_factory.mktemp("pose")
+    main = runpy.run_path(str(ROOT / "examples" / "body_pose.py"))["main"]
+    sizes = ["--files", "3", "--faces", "600", "--basis", "32", "--width", "32", "--steps", "150"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("njf_models.datasets.seen_poses.PER_FILE", 80)
+        degrees = main([*sizes, "--per-step", "40", "--out", str(folder)])
+        assert main([*sizes, "--per-step", "40", "--out", str(folder)]) == degrees  # done already
+    return folder, degrees
+
+
 @pytest.mark.slow
-def test_tasks_of_bodies(bodies_run, tmp_path):
-    """The other tasks, two of them by a chain of networks."""
+def test_poses_are_read_off_bodies(pose_run):
+    folder, degrees = pose_run
+    results = json.loads((folder / "results.json").read_text())
+    assert results["bodies"] == {"train": 240, "validation": 80, "test": 80}
+    assert results["degrees"]["mean"] == degrees["mean"]
+    seen = build_seen_poses(folder / "seen" / "test", 1, n_basis=32, n_faces=600, seed=12)
+    at_rest = torch.linalg.vector_norm(seen.poses.unflatten(-1, (-1, 3)), dim=-1)
+    assert 0 < degrees["mean"] < 0.95 * float(torch.rad2deg(at_rest).mean())
+    assert len(results["degrees"]["joints"]) == 20
+    assert (folder / "results.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
+def test_tasks_of_bodies(bodies_run, pose_run, tmp_path):
+    """The other tasks, two of them by a chain of networks; two that read poses off shapes."""
     main = runpy.run_path(str(ROOT / "examples" / "body_maps.py"))["main"]
     data = bodies_run[0] / "bodies"
     spent = {}
@@ -95,6 +122,8 @@ def test_tasks_of_bodies(bodies_run, tmp_path):
         common += ["--init", str(bodies_run[0])] if task == "any-pose" else []
         if task in ("any-pose", "morphing"):
             common += ["--after", str(tmp_path / "unpose"), "--whole", "0"]
+        if task in ("unpose", "morphing"):
+            common += ["--pose", str(pose_run[0])]
         table = main([*common, "--task", task, "--out", str(out), "--data", str(data)])
         assert table["ours"]["maps"] == 2 * 2 * per_source
         assert 0 < table["ours"]["L2-V"] < 1.2 * table["untrained"]["L2-V"]

@@ -29,7 +29,7 @@ class DisplacementField(CodedModel):
         width: size of the hidden layers.
         parts: as of `NeuralJacobianField`, to tell what its field alone brings.
         octaves: of a `field.PartField`.
-        coding: `rotations`, `basis` and `code_scale` of `encoding.CodedModel`.
+        coding: `rotations`, `basis`, `joints` and `code_scale` of `encoding.CodedModel`.
     """
 
     samples: ClassVar[CellKind | None] = "vertices"
@@ -67,7 +67,7 @@ class DisplacementField(CodedModel):
                 parts=parts,
                 width=width,
                 octaves=octaves,
-                rotations=parameters // 3 if self.rotations else 0,
+                rotations=self.n_matrices,
             )
         else:
             self.field = FieldMLP(self.code_size, face_features, output_dim, width)

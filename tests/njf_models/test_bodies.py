@@ -14,7 +14,8 @@ from torch.testing import assert_close
 import diffpoisson as dp
 from njf_models import NeuralJacobianField
 from njf_models.agnosticism import compare_triangulations
-from njf_models.datasets import bodies
+from njf_models.basis_points import basis_features
+from njf_models.datasets import bodies, seen_poses
 from njf_models.datasets.bodies import (
     PHENOTYPES,
     POSE_SIZE,
@@ -25,7 +26,8 @@ from njf_models.datasets.bodies import (
     draw_body,
     retriangulated,
 )
-from njf_models.datasets.poses import JOINTS
+from njf_models.datasets.poses import JOINTS, sample_pose
+from njf_models.datasets.seen_poses import build_seen_poses
 from njf_models.datasets.store import StoreError
 from njf_models.datasets.triangulation import Triangulation
 from njf_models.metrics import l2_vertices
@@ -240,3 +242,28 @@ def test_an_empty_folder_raises(tmp_path):
     with pytest.raises(StoreError, match="holds no bodies"):
         BodyStore(tmp_path)
     assert bodies.POSE_SIZE == 60
+
+
+def test_seen_poses_are_those_of_their_bodies_and_kept(model, tmp_path, monkeypatch):
+    monkeypatch.setattr(seen_poses, "PER_FILE", 16)
+    arguments = {"n_basis": 8, "n_faces": 400, "seed": 5, "progress": False}
+    seen = build_seen_poses(tmp_path, 2, **arguments)
+    assert seen.features.shape == (32, 4, 8)
+    rng = np.random.default_rng([5, 1])  # of the second file
+    phenotype = torch.tensor([rng.uniform(*limits) for limits in PHENOTYPES.values()])
+    poses = [torch.from_numpy(sample_pose(rng)).float().flatten() for _ in range(8)]
+    assert_close(seen.poses[16:24], torch.stack(poses))
+    triangulation = Triangulation.decimated(model.reference, 400)
+    vertices = triangulation.deformed(model.vertices(phenotype, poses[3][None]).double())[0]
+    expected = basis_features(dp.Mesh(vertices, triangulation.faces), 8)
+    assert_close(seen.features[19].double(), expected, rtol=1e-3, atol=1e-3)
+    assert len(seen.poses.unique(dim=0)) == 32
+    # What is there is kept, and more can be added.
+    monkeypatch.setattr(seen_poses, "BodyModel", None)
+    again = build_seen_poses(tmp_path, 2, **arguments)
+    assert torch.equal(again.features, seen.features)
+    assert torch.equal(build_seen_poses(tmp_path, 1, **arguments).poses, seen.poses[:16])
+    with pytest.raises(TypeError, match="not callable"):
+        build_seen_poses(tmp_path, 3, **arguments)
+    with pytest.raises(StoreError, match="pairs of other settings"):
+        build_seen_poses(tmp_path, 2, **(arguments | {"n_basis": 10}))

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from njf_models import NeuralJacobianField, Shape
 from njf_models.field import FieldMLP, PartField
 from njf_models.pointnet import PointNet
+from njf_models.products import MatrixProducts
 from tests.njf_models.shapes import bumpy_disk, ellipsoid, prepared, randomised
 
 
@@ -190,4 +191,41 @@ def test_a_code_has_the_matrices_of_its_rotations_and_its_shapes_scaled():
     with pytest.raises(ValueError, match="three parameters each, got 7"):
         NeuralJacobianField(6, 6, parameters=7, rotations=True)
     with pytest.raises(ValueError, match="encodes no shapes"):
-        NeuralJacobianField(6, 0, parameters=7).encode_shape(points)
+        NeuralJacobianField(6, 0, parameters=7).encode_source(points)
+
+
+def test_products_of_matrices_are_those_of_linear_algebra():
+    """Three rotations, of whose product any chain of joints is a special case."""
+    products = MatrixProducts(3, n_outputs=2, columns=3).double()
+    R = torch.from_numpy(Rotation.random(3, random_state=0).as_matrix())
+    first, second, third = products.factors
+    for factors in products.factors:
+        torch.nn.init.zeros_(factors)
+    with torch.no_grad():
+        first[0, 0, 0] = first[1, 0, 1] = 1  # X₃ = R₀ R₁
+        second[0, 0, 3] = second[1, 0, 2] = 1  # X₃₊₄₈ = X₃ R₂
+        third[0, 5, 51] = third[1, 5, 3] = 1  # R₀ R₁ R₂ R₀ R₁
+        products.mixed[51, :, 0] = torch.eye(3)
+        products.mixed[3 + 2 * 48 + 5, :, 1] = torch.eye(3)
+        products.mixed[0, :, 1] = 2 * torch.eye(3)
+    identity = torch.eye(3)
+    got = products((R - identity)[None])[0]
+    assert got.shape == (2, 3, 3)
+    assert_close(got[0], R[0] @ R[1] @ R[2] - identity)
+    chain = R[0] @ R[1] @ R[2] @ R[0] @ R[1] - identity
+    assert_close(got[1], chain + 2 * (R[0] - identity))
+
+
+def test_a_part_field_sees_waves_and_multiplies_the_matrices_that_end_its_code():
+    field = randomised(PartField(4 + 18, 4, 6, 9, parts=8, width=8, octaves=2, rotations=2))
+    features, told = torch.randn(5, 6).double(), torch.randn(3, 18).double()
+    source = torch.randn(4).double()
+    code = torch.cat([source.expand(3, -1), told], dim=1)
+    x = features[:, :3] * torch.pi
+    seen = torch.cat([features, x.sin(), x.cos(), (2 * x).sin(), (2 * x).cos()], dim=1)
+    w = field.of_face(seen, source)
+    w = torch.cat([(3 * w[:, :2]).softmax(-1), w[:, 2:]], dim=1)
+    M = field.of_code(code).view(3, 8, 3, 3) + field.of_rotations(told.view(3, 2, 3, 3))
+    expected = torch.einsum("mk,tkij->tmij", w, M).flatten(-2)
+    assert_close(field(features, code), expected, rtol=1e-9, atol=1e-9)
+    assert field.of_rotations.mixed.abs().max() > 0

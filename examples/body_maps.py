@@ -97,7 +97,7 @@ class Recipe(NamedTuple):
 
 IN_PARTS = Recipe(16, 8, 192, 3e-3, {"parts": 128, "octaves": 5})
 OF_EACH_FACE = Recipe(8, 8, 100, 2e-3, {})
-ONE_TARGET = Recipe(32, 1, 128, 2e-3, {})
+ONE_TARGET = Recipe(32, 1, 128, 3e-3, {"parts": 128, "octaves": 4})
 EARLIER = "earlier, cpu seconds"
 WARMUP = 300  # steps; begun at the full rate, a field of parts may stay near the identity
 
@@ -238,7 +238,7 @@ def maps_of(
 def recipe(kind: str, options: argparse.Namespace) -> Recipe:
     """How a model is trained on a task, with what the command line says."""
     if TASKS[options.task].told == "nothing":
-        chosen = ONE_TARGET  # what parts save, they save over the targets of a source
+        chosen = ONE_TARGET
     else:
         chosen = IN_PARTS if kind in ("njf", "displacement-parts") else OF_EACH_FACE
     said = {name: getattr(options, name) for name in ("per_step", "targets", "cells")}

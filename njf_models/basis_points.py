@@ -18,6 +18,7 @@ import diffpoisson as dp
 from njf_models.features import bounding_box_centre
 from njf_models.layers import smooth_layers
 
+_PAIR = 4  # numbers that a point of a pair sees
 _BOX = (0.9, 0.45, 1.0)  # half its sides, in metres: bodies reach little further in most poses
 
 
@@ -61,7 +62,7 @@ def basis_features(mesh: dp.Mesh, n: int) -> Float[Tensor, "pairs 8"]:
 
 def reflected_basis(features: Float[Tensor, "*b pairs 8"]) -> Float[Tensor, "*b pairs 8"]:
     """What the basis points see of the mirror image in x = 0: each what its own image saw."""
-    swapped = features.roll(4, dims=-1)
+    swapped = features.roll(_PAIR, dims=-1)
     return swapped * features.new_tensor([-1, 1, 1, 1]).repeat(2)
 
 

@@ -19,6 +19,8 @@ _ROWS = 2048
 # Shares of parts, at the start of a training, are those of the nearest few parts, not of all alike.
 _SHARPNESS = 3.0
 
+_OCTAVE = 2  # how much shorter each wave of a coordinate is than the one before
+
 
 class FieldMLP(nn.Module):
     """Five linear layers, 128 wide, group norms between; the last starts at zero: the identity map.
@@ -212,7 +214,9 @@ class PartField(nn.Module):
         """w of each face; arguments as of `FieldMLP`, but the source's part of the codes only."""
         x = features[..., :3]
         waves = [
-            f(torch.pi * 2**k * x) for k in range(self.octaves) for f in (torch.sin, torch.cos)
+            f(torch.pi * _OCTAVE**k * x)
+            for k in range(self.octaves)
+            for f in (torch.sin, torch.cos)
         ]
         w = self.of_face(torch.cat([features, *waves], dim=-1), source, part_of_face)
         shares, others = w.split((self.shares, w.shape[-1] - self.shares), dim=-1)

@@ -38,7 +38,12 @@ class MatrixProducts(nn.Module):
         X = matrices
         for factors in self.factors:
             A, B = torch.einsum("sjn,bnxy->sbjxy", factors, X)
-            X = torch.cat([X, A + B + A @ B], dim=1)
+            X = torch.cat([X, _product(A, B)], dim=1)
         rows = X.transpose(1, 2).flatten(2)  # (b, 3, n 3), for one product of matrices
         mixed = rows @ self.mixed.flatten(2).flatten(0, 1)
         return mixed.unflatten(-1, self.mixed.shape[2:]).transpose(1, 2)
+
+
+def _product(A: Float[Tensor, "*b 3 3"], B: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
+    """(I + A)(I + B) - I."""
+    return A + B + A @ B

@@ -66,7 +66,6 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--files", type=int, default=60, metavar="N", help="of a thousand bodies (60)")
     add("--faces", type=int, default=2500, help="of the triangulation (2500)")
     add("--basis", type=int, default=256, metavar="N", help="points to see shapes from (256)")
-    add("--width", type=int, default=512, metavar="N", help="of hidden layers (512)")
     add("--steps", type=int, default=10000, help="of the training (10000)")
     add("--per-step", type=int, default=128, metavar="N", help="bodies (128)")
     add("--seed", type=int, default=0)
@@ -93,8 +92,7 @@ def make_pairs(options: argparse.Namespace) -> dict[str, SeenPoses]:
 def fit(seen: dict[str, SeenPoses], options: argparse.Namespace) -> Path:
     """Train, going on from the last checkpoint if there is one; the best by validation loss."""
     lightning.seed_everything(options.seed, verbose=False)
-    arguments = {"basis": options.basis, "width": options.width}
-    module = PoseTraining(arguments, steps=options.steps)
+    module = PoseTraining({"basis": options.basis}, steps=options.steps)
     trainer = make_trainer(
         options.out, steps=options.steps, validate_every=options.steps // N_VALIDATIONS
     )

@@ -88,7 +88,7 @@ def poses_read_off_bodies(tmp_path_factory):
     """A folder of `body_pose.py`, trained for seconds, and its mean errors."""
     folder = tmp_path_factory.mktemp("pose")
     main = runpy.run_path(str(ROOT / "examples" / "body_pose.py"))["main"]
-    sizes = ["--files", "3", "--faces", "600", "--basis", "32", "--width", "32", "--steps", "150"]
+    sizes = ["--files", "3", "--faces", "600", "--basis", "32", "--steps", "150"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("njf_models.datasets.seen_poses.PER_FILE", 80)
         degrees = main([*sizes, "--per-step", "40", "--out", str(folder)])

@@ -169,6 +169,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add(
         "--basis", type=int, metavar="N", help="points to see shapes from; 0: PointNet (256; RUN's)"
     )
+    add("--basis-at", choices=("box", "body"), default="box", help="where these are (box)")
     add("--points", type=int, default=256, metavar="N", help="that PointNet sees (256)")
     add("--pose", type=Path, metavar="RUN", help="of body_pose.py: read poses off shapes")
     add("--energies", type=int, default=0, metavar="N", help="of the wave-kernel signature (0)")
@@ -208,12 +209,13 @@ def make_bodies(options: argparse.Namespace) -> list[BodyStore]:
     ]
 
 
-def inputs(options: argparse.Namespace) -> dict[str, int]:
+def inputs(options: argparse.Namespace) -> dict[str, Any]:
     """What the networks see."""
     return {
         "n_points": options.points,
         "n_energies": options.energies,
         "n_basis": options.basis,
+        "basis_at": options.basis_at,
     }
 
 
@@ -253,6 +255,7 @@ def make_module(kind: str, steps: int, options: argparse.Namespace) -> NJFTraini
         "point_features": n_features,
         "code_size": options.code_size,
         "basis": options.basis,
+        "basis_at": options.basis_at,
         "code_scale": CODE_SCALE,
         **how.arguments,
     }

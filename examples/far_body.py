@@ -99,7 +99,11 @@ def built_in(
         body = retriangulated(model, original, replace(near, phenotype=parameters))
         seen = network.inputs
         maps = BodyMaps(
-            [body], n_points=seen.n_points, n_energies=seen.n_energies, n_basis=seen.n_basis
+            [body],
+            n_points=seen.n_points,
+            n_energies=seen.n_energies,
+            n_basis=seen.n_basis,
+            basis_at=seen.basis_at,
         )
         records, emitted = evaluate_maps(network.model, maps)
         table[name] = summarise(records)

@@ -85,6 +85,7 @@ def _map(model: Model, body: Body, inputs: Inputs) -> Float[Tensor, "t n 3"]:
         n_points=inputs.n_points,
         n_energies=inputs.n_energies,
         n_basis=inputs.n_basis,
+        basis_at=inputs.basis_at,
     )
     batch = maps[0]
     return model(batch.shape, encoded(model, batch)).vertices.double()

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 import diffpoisson as dp
-from njf_models.basis_points import basis_features
+from njf_models.basis_points import BasisPlace, basis_features
 from njf_models.datasets.bodies import Body, BodyStore
 from njf_models.datasets.partial import Partial, cut_pieces
 from njf_models.datasets.poses import reflected
@@ -102,6 +102,7 @@ class BodyMaps(Dataset[Batch]):
         n_points: how many points the encoder sees.
         n_energies: length of the wave-kernel signature that the network sees, 0 for none.
         n_basis: how many basis points the encoder sees shapes from, instead of points on them.
+        basis_at: where these are.
         resample: draw points, pieces and targets anew at each access (training), or always the
             same (evaluation).
 
@@ -119,11 +120,12 @@ class BodyMaps(Dataset[Batch]):
         n_points: int = 1024,
         n_energies: int = 50,
         n_basis: int = 0,
+        basis_at: BasisPlace = "box",
         resample: bool = False,
     ) -> None:
         self.bodies, self.task, self.resample = bodies, task or Task(), resample
         self.n_targets, self.n_points, self.n_energies = n_targets, n_points, n_energies
-        self.n_basis = n_basis
+        self.n_basis, self.basis_at = n_basis, basis_at
         if n_basis and self.task.pieces:
             raise ValueError("BodyMaps: basis points see whole sources only; use points on them")
         if self.task.others and len(bodies) < 2:
@@ -222,7 +224,8 @@ class BodyMaps(Dataset[Batch]):
         return self._body(body).posed[pose]
 
     def _seen_by_basis(self, vertices: Float[Tensor, "n 3"]) -> Float[Tensor, "pairs 8"]:
-        return basis_features(dp.Mesh(vertices, self._body(0).faces), self.n_basis)
+        mesh = dp.Mesh(vertices, self._body(0).faces)
+        return basis_features(mesh, self.n_basis, self.basis_at)
 
     def _vertices(self, index: int) -> Float[Tensor, "n 3"]:
         """Of the whole body that is a source, where networks took it to if they did."""

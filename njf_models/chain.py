@@ -144,7 +144,7 @@ class ChainedNJF(WholeShapes, nn.Module):
             mesh = shape.mesh.with_vertices(vertices.to(shape.mesh.dtype))
             dtype = shape.features.dtype
             if link.n_basis:
-                points = basis_features(mesh, link.n_basis).to(dtype)
+                points = basis_features(mesh, link.n_basis, link.basis_at).to(dtype)
             else:
                 points = point_features(mesh, samples).to(dtype)
             start = Start.of(link, vertices, J, face_features(mesh).to(dtype), points)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from njf_models.basis_points import BasisEncoder
+from njf_models.basis_points import BasisEncoder, BasisPlace
 from njf_models.pointnet import PointNet
 from njf_models.pose_estimator import PoseEstimator
 from njf_models.rotation_vectors import rotation_matrices
@@ -25,6 +25,7 @@ class CodedModel(nn.Module):
             chain of joints multiplies matrices, and vectors say so only after an exponential.
         basis: how many basis points the encoder sees a shape from, instead of points on it, which
             PointNet sees; 0 for PointNet.
+        basis_at: where basis points are.
         joints: how many rotations a `pose_estimator.PoseEstimator` reads off a shape, from the same
             basis points; the code has them, too. Training leaves it as it is. 0 for none.
         code_scale: factor of what the encoder makes. Its entries are largest values of many points,
@@ -32,6 +33,7 @@ class CodedModel(nn.Module):
 
     Attributes:
         n_basis: as `basis`.
+        basis_at: as above.
         code_size: size z of the whole code.
         source_size: how many of its entries are of the source alone; they come first.
         n_matrices: how many matrices less the identity end the code, of rotations: parameters; or
@@ -48,6 +50,7 @@ class CodedModel(nn.Module):
         parameters: int,
         rotations: bool = False,
         basis: int = 0,
+        basis_at: BasisPlace = "box",
         joints: int = 0,
         code_scale: float = 1.0,
     ) -> None:
@@ -57,7 +60,7 @@ class CodedModel(nn.Module):
                 f"rotations are vectors of three parameters each, got {parameters} parameters"
             )
         self.encodes_target, self.rotations = encodes_target, rotations
-        self.n_basis, self.code_scale = basis, code_scale
+        self.n_basis, self.basis_at, self.code_scale = basis, basis_at, code_scale
         self.encoder: PointNet | BasisEncoder | None = None
         if point_features:
             self.encoder = (

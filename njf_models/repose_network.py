@@ -75,12 +75,12 @@ class ReposeNetwork(TrainedNetwork):
             checkpoints: all but the last of networks that take bodies nearer to rest.
 
         Raises:
-            ValueError: their inputs differ, but for how many basis points they are seen from.
+            ValueError: their inputs differ, but for the basis points that they are seen from.
         """
         links = [cls.from_checkpoint(path) for path in checkpoints]
         if len(links) == 1:
             return links[0]
-        if len({replace(link.inputs, n_basis=0) for link in links}) != 1:
+        if len({replace(link.inputs, n_basis=0, basis_at="box") for link in links}) != 1:
             raise ValueError(f"ReposeNetwork.chained: inputs of {checkpoints} differ")
         inputs = links[-1].inputs
         arguments = {"links": [link.arguments for link in links], "n_points": inputs.n_points}

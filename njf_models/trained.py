@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 import diffpoisson as dp
-from njf_models.basis_points import basis_features
+from njf_models.basis_points import BasisPlace, basis_features
 from njf_models.features import Shape, point_features
 from njf_models.models import MODELS
 
@@ -30,12 +30,14 @@ class Inputs:
         n_energies: length of the wave-kernel signature, 0 for none.
         n_eigenpairs: of the spectrum, for networks that diffuse, 0 for none.
         n_basis: how many basis points the encoder sees a shape from, instead of points on it.
+        basis_at: where these are.
     """
 
     n_points: int = 1024
     n_energies: int = 0
     n_eigenpairs: int = 0
     n_basis: int = 0
+    basis_at: BasisPlace = "box"
 
     def of(self, mesh: dp.Mesh) -> tuple[Shape, Float[Tensor, "s f"]]:
         """A mesh prepared for the network, and what the encoder sees of it, float32.
@@ -46,7 +48,7 @@ class Inputs:
         if self.n_energies:
             wks = dp.wave_kernel_signature(mesh, self.n_energies, solver=solver)
         if self.n_basis:
-            points = basis_features(mesh, self.n_basis).float()
+            points = basis_features(mesh, self.n_basis, self.basis_at).float()
         else:
             generator = torch.Generator().manual_seed(0)
             samples = dp.sample_surface(mesh, self.n_points, generator=generator)

@@ -13,12 +13,16 @@ import diffpoisson as dp
 from njf_models import NeuralJacobianField
 from njf_models.basis_points import BasisEncoder, basis_features, basis_points, reflected_basis
 from njf_models.body_maps import BodyMaps, CellSampler, Task
+from njf_models.chain import ChainedNJF
 from njf_models.datasets.bodies import POSE_SIZE
 from njf_models.datasets.poses import JOINTS, reflected, sample_pose
 from njf_models.datasets.seen_poses import SeenPoses
+from njf_models.features import Shape
 from njf_models.pose_estimator import PoseEstimator, angles_between
 from njf_models.pose_training import PoseTraining, joint_errors, pose_loader
+from njf_models.trained import Inputs
 from njf_models.training import NJFTraining, last_checkpoint, make_trainer
+from tests.njf_models.shapes import randomised
 from tests.njf_models.test_body_maps import twisted
 
 UNSEEN_PIECES = Task(sources=2, told="points", pieces=1, radii=(0.3, 0.4))
@@ -47,6 +51,37 @@ def test_basis_points_are_pairs_in_a_box_and_always_the_same():
     for n in (0, 3, -2):
         with pytest.raises(ValueError, match=f"pairs, of an even number of points, got {n}"):
             basis_points(n)
+
+
+def test_basis_points_on_the_average_body_are_pairs_of_a_standing_one():
+    points = basis_points(1228, "body")
+    assert points.shape == (614, 2, 3)
+    assert (points[:, 0] * torch.tensor([-1.0, 1, 1]) == points[:, 1]).all()
+    assert (points[:, 0, 0] > 0).all()
+    assert_close(points.amax((0, 1)), -points.amin((0, 1)))
+    assert 1.6 < 2 * float(points[..., 2].max()) < 2.0
+    assert (basis_points(40, "body") == points[:20]).all()
+    # More of them where there is more to see: at the hands, a twentieth of the skin.
+    assert (points[..., 0].abs() > 0.45).double().mean() > 0.1
+    with pytest.raises(ValueError, match="there are 1228 basis points on the body, got n=1230"):
+        basis_points(1230, "body")
+    reached = points[:7].reshape(-1, 3) + basis_features(box(), 14, "body").view(-1, 4)[:, :3]
+    half = torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64)
+    assert_close((reached.abs() - half).amax(1), torch.zeros(14).double(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("place", ["box", "body"])
+def test_all_see_the_same(place):
+    """Batches, trained networks and chains: a body and its code."""
+    body, sizes = twisted(2), MODEL | {"basis_at": place}
+    maps = BodyMaps([body], Task(sources=1, told="nothing"), basis_at=place, **SEEN)
+    mesh = dp.Mesh(body.posed[0].double(), body.faces)
+    expected = basis_features(mesh, 16, place).float()
+    assert_close(maps[0].points[0], expected)
+    assert_close(Inputs(n_basis=16, basis_at=place).of(mesh)[1], expected)
+    network = randomised(NeuralJacobianField(**sizes)).float().eval()
+    start = ChainedNJF.of([network], 4).start(Shape.prepare(mesh))
+    assert_close(start.code, network.encode(expected[None])[0])
 
 
 def test_ways_lead_to_the_closest_points_of_a_box():

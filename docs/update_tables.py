@@ -505,6 +505,37 @@ def body_tasks() -> str:
     return "\n".join(lines)
 
 
+def body_pose() -> str:
+    """Poses read off shapes, from `examples/body_pose.py`."""
+    results = json.loads((RESULTS / "body_pose.json").read_text())
+    degrees, options = results["degrees"], results["options"]
+    joints = sorted(degrees["joints"].items(), key=lambda row: row[1])
+    ends = [f"{name}, {number(angle)}°" for name, angle in (joints[0], joints[-1])]
+    seconds = results["training"]["cpu seconds"]
+    head = "| bodies to learn from | training | unseen bodies | mean angle | least | largest |"
+    cells = [
+        f"{results['bodies']['train']:,}",
+        f"{options['steps']:,} steps of {options['per_step']} bodies, "
+        f"{seconds / 60:.1f} minutes of CPU time",
+        f"{results['bodies']['test']:,}",
+        f"{number(degrees['mean'])}°",
+        *ends,
+    ]
+    return "\n".join([head, "|---" * 6 + "|", f"| {' | '.join(cells)} |"])
+
+
+def body_tricks() -> str:
+    """Variants of the re-posing network, from `tests/benchmarks/body_tricks.py`."""
+    results = json.loads((RESULTS / "body_tricks.json").read_text())
+    lines = [f"| {results['minutes']:g} minutes of CPU time each | steps | L2-V | L2-J |"]
+    lines.append("|---" * 4 + "|")
+    for name, row in results["variants"].items():
+        lines.append(
+            f"| {name} | {row['steps']:,} | {number(row['L2-V'])} | {number(row['L2-J'])} |"
+        )
+    return "\n".join(lines)
+
+
 def far_bodies() -> str:
     """Bodies outside the range of training, from `examples/far_body.py`."""
     results = json.loads((RESULTS / "far_bodies.json").read_text())
@@ -848,6 +879,8 @@ TABLES = {
     "contact": contact,
     "repose": repose,
     "body_tasks": body_tasks,
+    "body_pose": body_pose,
+    "body_tricks": body_tricks,
     "far_bodies": far_bodies,
     "repose_rate": repose_rate,
     "triangulations": triangulations,

@@ -75,10 +75,16 @@ class TrainedNetwork:
         self.arguments, self.inputs, self.kind = arguments, inputs, kind
         self.model = MODELS[kind](**arguments).eval()
 
-    def save(self, path: Path | str) -> None:
-        """Write weights, arguments and inputs to one safetensors file."""
+    def save(self, path: Path | str, dtype: torch.dtype | None = None) -> None:
+        """Write weights, arguments and inputs to one safetensors file.
+
+        Args:
+            path: of the file.
+            dtype: of the weights in it, if not their own: half precision makes it half as large.
+        """
         about = {"kind": self.kind, "arguments": self.arguments, "inputs": asdict(self.inputs)}
-        state = {name: value.contiguous() for name, value in self.model.state_dict().items()}
+        weights = self.model.state_dict()
+        state = {name: value.to(dtype).contiguous() for name, value in weights.items()}
         save_file(state, path, metadata={self.holds: json.dumps(about)})
 
     @classmethod

@@ -13,6 +13,8 @@ import json
 from importlib.metadata import version
 from pathlib import Path
 
+import torch
+
 from njf_models.repose_network import ReposeNetwork
 
 EARLIER = "earlier, cpu seconds"
@@ -29,13 +31,14 @@ def main() -> None:
     runs = [*options.after, options.run]
     network = ReposeNetwork.chained([run / "njf" / "checkpoints" / "best.ckpt" for run in runs])
     name, start = ("repose-any", "any pose") if options.after else ("repose", "the rest pose")
-    network.save(WEIGHTS / f"{name}.safetensors")
+    network.save(WEIGHTS / f"{name}.safetensors", torch.float16)
     results = json.loads((options.run / "results.json").read_text())
     told, training, errors = (results[key] for key in ("options", "training", "summary"))
     steps = " and ".join(f"{n} {phase}" for phase, n in training["ours"]["steps"].items())
     card = {
         "what": f"bodies from {start} to poses of twenty joints: Neural Jacobian Field",
         "parameters": sum(p.numel() for p in network.model.parameters()),
+        "precision": "half in the file, single in use",
         "bytes": (WEIGHTS / f"{name}.safetensors").stat().st_size,
         "licence of the weights": "MIT",
         "data": f"{told['bodies']} random adults in {told['poses']} random poses each, of "

@@ -5,7 +5,8 @@ from any pose to pose parameters; `registration`: a body with pieces cut away on
 same body in another pose; `morphing`: a body in any pose onto points of another body in any pose.
 `--pose RUN` tells networks the pose that `examples/body_pose.py` reads off a source that is taken
 to rest, or off the target of morphing. With `--after RUN ...` the maps are a chain: they start from
-where the networks of other folders, trained to unpose, take the bodies.
+where the networks of other folders, trained to unpose, take the bodies. With `--also N ...` sampled
+steps see the bodies on triangulations of so many faces, too.
 
 Random bodies → poses inside joint limits → training → evaluation on bodies and poses that were
 never seen. Training has two phases, one optimizer and one schedule: first on random faces of
@@ -45,6 +46,7 @@ from njf_models.body_maps import (
     BodyMaps,
     CellSampler,
     MapRecord,
+    MixedSampler,
     body_loader,
     cell_loader,
     evaluate_maps,
@@ -52,7 +54,14 @@ from njf_models.body_maps import (
 from njf_models.body_report import BodyRow, save_body_report
 from njf_models.carried import carry
 from njf_models.chain import ChainedNJF
-from njf_models.datasets.bodies import POSE_SIZE, Body, BodySettings, BodyStore, build_bodies
+from njf_models.datasets.bodies import (
+    POSE_SIZE,
+    Body,
+    BodySettings,
+    BodyStore,
+    build_bodies,
+    build_retriangulated,
+)
 from njf_models.datasets.poses import JOINTS
 from njf_models.evaluation import format_table
 from njf_models.experiments import circumstances, quiet, training_cost
@@ -157,6 +166,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--poses", type=int, default=16, metavar="N", help="of each (16)")
     add("--held-out", type=int, default=16, metavar="N", help="test identities (16)")
     add("--faces", type=int, default=2500, help="of the triangulation (2500)")
+    add("--also", type=int, nargs="+", default=[], metavar="N", help="other triangulations' faces")
     add("--sources", type=int, metavar="N", help="poses of a body that are sources (the task's)")
     add("--targets", type=int, metavar="N", help="of a source per step (the model's)")
     add("--steps", type=int, default=3000, help="of the Neural Jacobian Field (3000)")
@@ -190,6 +200,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         options.basis = pose_training(options).hparams["estimator"]["basis"]
     elif options.basis is None:
         options.basis = 0 if TASKS[options.task].pieces else 256
+    if options.also and options.after:
+        parser.error("--also is for maps from bodies as they are, not --after others")
     options.models = options.models or ["njf", "displacement", "cages"]
     options.data = options.data or options.out / "bodies"
     return options
@@ -293,10 +305,23 @@ def loaders(
     phases: dict[str, DataLoader[Any]] = {}
     samples = MODELS[kind.removesuffix("-parts")].samples
     if samples is not None:
-        phases["sampled"] = cell_loader(CellSampler(maps, samples, how.cells), how.per_step)
+        others = [
+            maps_of(x, options, kind=kind, training=True) for x in elsewhere(len(train), options)
+        ]
+        samplers = [CellSampler(x, samples, how.cells) for x in (maps, *others)]
+        phases["sampled"] = cell_loader(MixedSampler(samplers), how.per_step)
     if samples is None or options.whole > 0:
         phases["whole"] = body_loader(maps, shuffle=True)
     return phases
+
+
+def elsewhere(n: int, options: argparse.Namespace) -> list[BodyStore]:
+    """The first training bodies on the triangulations of `--also`, which are finer at the feet."""
+    train = BodyStore(options.data / "train", n)
+    return [
+        build_retriangulated(options.data / f"train-{n}", train, n, grading=-1.0)
+        for n in options.also
+    ]
 
 
 def carried(bodies: BodyStore, options: argparse.Namespace, name: str) -> list[Body]:

@@ -326,12 +326,33 @@ class CellSampler:
         return points.unflatten(0, targets.shape[:2])
 
 
+class MixedSampler:
+    """Draws the cells of each step on one of several triangulations of the same bodies.
+
+    Args:
+        samplers: of the same maps, each on another triangulation.
+
+    Raises:
+        ValueError: they have different numbers of maps.
+    """
+
+    def __init__(self, samplers: Sequence[CellSampler]) -> None:
+        numbers = [len(sampler.maps) for sampler in samplers]
+        if len(set(numbers)) != 1:
+            raise ValueError(f"MixedSampler: samplers of the same maps are mixed, got {numbers}")
+        self.samplers, self.maps = samplers, samplers[0].maps
+
+    def __call__(self, indices: Sequence[int]) -> Cells:
+        """Cells of the sources of these numbers, on a triangulation that is drawn."""
+        return self.samplers[int(torch.randint(len(self.samplers), ()))](indices)
+
+
 def body_loader(maps: BodyMaps, *, shuffle: bool = False) -> DataLoader[Batch]:
     """One body a step. Factors live in this process, so there are no workers."""
     return DataLoader(maps, batch_size=None, shuffle=shuffle)
 
 
-def cell_loader(sampler: CellSampler, n_sources: int) -> DataLoader[Cells]:
+def cell_loader(sampler: CellSampler | MixedSampler, n_sources: int) -> DataLoader[Cells]:
     """Cells of so many sources a step, shuffled; of all, if there are fewer."""
     numbers: Any = range(len(sampler.maps))  # a list of numbers does for a data set
     n = min(n_sources, len(sampler.maps))

@@ -262,6 +262,41 @@ def build_bodies(
     return BodyStore(folder, n_bodies)
 
 
+def build_retriangulated(
+    folder: Path | str,
+    bodies: BodyStore,
+    n_faces: int,
+    grading: float = 0.0,
+    *,
+    progress: bool = True,
+) -> BodyStore:
+    """The bodies of a data set, in the same poses, on another triangulation; kept in files.
+
+    Interrupted, it goes on where it stopped when it is repeated.
+
+    Args:
+        folder: for the files.
+        bodies: the data set.
+        n_faces: of the triangulation.
+        grading: of `Triangulation.decimated`.
+        progress: show a progress bar.
+
+    Raises:
+        StoreError: the folder holds other bodies.
+        ModuleNotFoundError: some are missing, and anny is not installed.
+    """
+    folder = Path(folder)
+    key = fingerprint(_FORMAT, _read(bodies.paths[0])[1], n_faces, grading)
+    missing = [body for body in bodies if not _present(_path(folder, body.number), key)]
+    if missing:
+        model = BodyModel()
+        triangulation = Triangulation.decimated(model.reference, n_faces, grading)
+        for body in tqdm(missing, desc=f"on {n_faces} faces", disable=not progress):
+            moved = retriangulated(model, triangulation, body)
+            write_atomically(_path(folder, body.number), _encode(moved, key))
+    return BodyStore(folder, len(bodies))
+
+
 def _path(folder: Path, number: int) -> Path:
     return folder / f"body-{number:06d}.safetensors"
 

@@ -23,6 +23,7 @@ from njf_models.datasets.bodies import (
     BodySettings,
     BodyStore,
     build_bodies,
+    build_retriangulated,
     draw_body,
     retriangulated,
 )
@@ -267,3 +268,20 @@ def test_seen_poses_are_those_of_their_bodies_and_kept(model, tmp_path, monkeypa
         build_seen_poses(tmp_path, 3, **arguments)
     with pytest.raises(StoreError, match="pairs of other settings"):
         build_seen_poses(tmp_path, 2, **(arguments | {"n_basis": 10}))
+
+
+def test_a_data_set_on_another_triangulation_has_the_same_bodies(model, tmp_path, monkeypatch):
+    some = build_bodies(tmp_path / "some", 2, 400, SETTINGS, progress=False)
+    other = build_retriangulated(tmp_path / "other", some, 600, grading=-1.0, progress=False)
+    triangulation = Triangulation.decimated(model.reference, 600, -1.0)
+    for body, elsewhere in zip(some, other, strict=True):
+        assert torch.equal(elsewhere.faces, triangulation.faces)
+        expected = triangulation.deformed(model.vertices(body.phenotype, body.poses).double())
+        assert_close(elsewhere.posed.double(), expected, rtol=1e-6, atol=1e-6)
+        assert torch.equal(body.poses, elsewhere.poses)
+        assert body.number == elsewhere.number
+    monkeypatch.setattr(bodies, "BodyModel", None)  # all there
+    again = build_retriangulated(tmp_path / "other", some, 600, grading=-1.0, progress=False)
+    assert torch.equal(again[1].posed, other[1].posed)
+    with pytest.raises(StoreError, match="bodies of other settings"):
+        build_retriangulated(tmp_path / "other", some, 600, grading=0.0, progress=False)

@@ -15,6 +15,7 @@ from njf_models.baselines.displacement import DisplacementField
 from njf_models.body_maps import (
     BodyMaps,
     CellSampler,
+    MixedSampler,
     Task,
     body_loader,
     cell_loader,
@@ -291,3 +292,24 @@ def test_phases_are_one_training_that_resumes_in_either(tmp_path, kind):
     trained = summarise(evaluate_maps(load_checkpoint(last_checkpoint(tmp_path)), examples)[0])
     for error in ("L2-V", "L2-J", "L2-N, degrees"):
         assert trained[error] < 0.7 * untrained[error]
+
+
+def test_a_step_sees_one_of_several_triangulations():
+    """Of either, as drawn; and samplers are of the same maps only."""
+    coarse = [twisted(number) for number in range(3)]
+    other = [replace(body, faces=body.faces.flip(0)) for body in coarse]
+    maps = [BodyMaps(of, n_targets=2, resample=True, **INPUTS) for of in (coarse, other)]
+    samplers = [CellSampler(one, "faces", 4) for one in maps]
+    mixed = MixedSampler(samplers)
+    assert mixed.maps is maps[0]
+    generator = torch.random.get_rng_state()
+    drawn = [int(torch.randint(2, ())) for _ in range(20)]
+    assert set(drawn) == {0, 1}
+    torch.random.set_rng_state(generator)
+    first = mixed([0, 2])
+    torch.random.set_rng_state(generator)
+    torch.randint(2, ())
+    assert torch.equal(first.features, samplers[drawn[0]]([0, 2]).features)
+    assert next(iter(cell_loader(mixed, 3))).features.shape == (3, 4, 6)
+    with pytest.raises(ValueError, match=r"same maps are mixed, got \[3, 2\]"):
+        MixedSampler([samplers[0], CellSampler(BodyMaps(other[:2], **INPUTS), "faces", 4)])

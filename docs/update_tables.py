@@ -527,7 +527,8 @@ def body_pose() -> str:
 def body_tricks() -> str:
     """Variants of the re-posing network, from `tests/benchmarks/body_tricks.py`."""
     results = json.loads((RESULTS / "body_tricks.json").read_text())
-    lines = [f"| {results['minutes']:g} minutes of CPU time each | steps | L2-V | L2-J |"]
+    minutes = f"{results['minutes']:g} minute{'s' * (results['minutes'] != 1)}"
+    lines = [f"| {minutes} of CPU time each | steps | L2-V | L2-J |"]
     lines.append("|---" * 4 + "|")
     for name, row in results["variants"].items():
         lines.append(

@@ -117,13 +117,16 @@ def test_memory_is_counted():
 
 
 def test_limits_are_rates_of_this_planet():
-    """From a thousand times too slow to a thousand times too fast."""
+    """From a million times too slow, as when another process has the core, to a thousand too fast.
+
+    In gigabytes, or for milliseconds, they would not be.
+    """
     for rate in (
         limits.bandwidth(1 << 16),
         limits.read_bandwidth(1 << 16),
         limits.peak_flops(torch.float32, 128),
     ):
-        assert 1e7 < rate < 1e13
+        assert 1e4 < rate < 1e13
 
 
 def test_energies_of_maps_know_scales_mirrors_charts_and_flips():

@@ -119,7 +119,7 @@ def test_memory_is_counted():
 def test_limits_are_rates_of_this_planet():
     """From a million times too slow, as when another process has the core, to a thousand too fast.
 
-    In gigabytes, or for milliseconds, they would not be.
+    In gigabytes, they would not be.
     """
     for rate in (
         limits.bandwidth(1 << 16),

@@ -452,7 +452,8 @@ def repose() -> str:
             lines.append(f"| {name} | {' | '.join(map(number, cells))} |")
     figures = [paper["ours"], *(paper.get(name) for name in theirs)]
     figures += [x and x / paper["ours"] for x in figures[1:]]
-    lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(map(number, figures))} |")
+    cells = ["–" if figure is None else number(figure) for figure in figures]
+    lines.append(f"| L2-V of the paper, on STAR | – | {' | '.join(cells)} |")
     spent = "; ".join(f"{name}: {spent_on(cost)}" for name, cost in costs.items())
     return "\n".join(
         [

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import igl
 import numpy as np
-import scipy.sparse as sp
 import torch
 from torch import Tensor
 
@@ -77,12 +76,17 @@ def components(n_vertices: int, faces: np.ndarray) -> np.ndarray:
 
 
 def poisson(vertices: np.ndarray, faces: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """(n, c) minimiser from libigl's gradient, its areas and a dense pseudo-inverse."""
+    """(n, c) minimiser from libigl's gradient, its areas and dense least squares.
+
+    Not by a pseudo-inverse of the normal equations: its cutoff can take the constants, whose
+    eigenvalue is rounding, for part of the range.
+    """
     G = igl.grad(vertices, faces).toarray()  # rows ordered by direction, then by face
     # libigl's areas are signed in the plane.
-    A = sp.diags(np.tile(np.abs(igl.doublearea(vertices, faces)) / 2, vertices.shape[1]))
+    areas = np.tile(np.abs(igl.doublearea(vertices, faces)) / 2, vertices.shape[1])
     stacked = np.concatenate(list(np.moveaxis(R, -1, 0)))
-    phi = np.linalg.pinv(G.T @ A @ G, hermitian=True) @ (G.T @ (A @ stacked))
+    root = np.sqrt(areas)[:, None]
+    phi = np.linalg.lstsq(root * G, root * stacked, rcond=None)[0]
     return centred(vertices, faces, phi)
 
 

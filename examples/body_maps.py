@@ -197,6 +197,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     options.out = options.out or Path("runs") / options.task
     options.carried = min(options.carried, options.poses)
     if options.pose is not None:
+        if options.basis_at != "box":
+            parser.error("--pose reads poses off what points of the box see, not --basis-at body")
         options.basis = pose_training(options).hparams["estimator"]["basis"]
     elif options.basis is None:
         options.basis = 0 if TASKS[options.task].pieces else 256
@@ -319,8 +321,8 @@ def elsewhere(n: int, options: argparse.Namespace) -> list[BodyStore]:
     """The first training bodies on the triangulations of `--also`, which are finer at the feet."""
     train = BodyStore(options.data / "train", n)
     return [
-        build_retriangulated(options.data / f"train-{n}", train, n, grading=-1.0)
-        for n in options.also
+        build_retriangulated(options.data / f"train-{n_faces}", train, n_faces, grading=-1.0)
+        for n_faces in options.also
     ]
 
 

@@ -25,7 +25,7 @@ from njf_models.experiments import circumstances, quiet, training_cost
 from njf_models.pose_training import PoseTraining, joint_errors, pose_loader
 from njf_models.training import last_checkpoint, make_trainer
 
-SEEDS = {"train": 10, "validation": 11, "test": 12}  # apart from those of the bodies in maps
+SEEDS = {"train": 10, "validation": 11, "test": 12}  # apart from those of maps of the same --seed
 N_VALIDATIONS = 10
 
 

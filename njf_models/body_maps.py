@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -133,7 +133,9 @@ class BodyMaps(Dataset[Batch]):
         self._n_poses = len(bodies[0].poses)
         self._body = lru_cache(maxsize=_KEPT_SOURCES)(bodies.__getitem__)  # a store reads files
         self._kept_source = lru_cache(maxsize=_KEPT_SOURCES)(self._make_source)
-        self._basis: dict[tuple[int, int], Tensor] = {}
+        # Nothing of what basis points see is drawn, and it is a few kilobytes.
+        self._basis_of_source = cache(lambda index: self._seen_by_basis(self._vertices(index)))
+        self._basis_of_target = cache(lambda *pair: self._seen_by_basis(self._posed(*pair)))
 
     def __len__(self) -> int:
         return len(self.bodies) * max(1, self.task.sources)
@@ -199,16 +201,12 @@ class BodyMaps(Dataset[Batch]):
         return torch.stack([self._posed(*pair) for pair in numbers.tolist()])[None], numbers[None]
 
     def basis_of_source(self, index: int) -> Float[Tensor, "pairs 8"]:
-        """What basis points see of a source; kept, since nothing of it is drawn."""
-        if (index, -2) not in self._basis:
-            self._basis[index, -2] = self._seen_by_basis(self._vertices(index))
-        return self._basis[index, -2]
+        """What basis points see of a source; kept."""
+        return self._basis_of_source(index)
 
     def basis_of_target(self, body: int, pose: int) -> Float[Tensor, "pairs 8"]:
         """What basis points see of a target; kept."""
-        if (body, pose) not in self._basis:
-            self._basis[body, pose] = self._seen_by_basis(self._posed(body, pose))
-        return self._basis[body, pose]
+        return self._basis_of_target(body, pose)
 
     def own_targets(
         self, index: int

@@ -109,6 +109,17 @@ def test_poses_are_read_off_bodies(pose_run):
     assert (folder / "results.png").stat().st_size > 20_000
 
 
+def test_options_of_bodies_that_contradict_each_other(capsys, tmp_path):
+    parse = runpy.run_path(str(ROOT / "examples" / "body_maps.py"))["parse"]
+    for options, words in (
+        (["--pose", str(tmp_path), "--basis-at", "body"], "--pose reads poses off"),
+        (["--also", "900", "--after", str(tmp_path)], "not --after others"),
+    ):
+        with pytest.raises(SystemExit):
+            parse(options)
+        assert words in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_tasks_of_bodies(bodies_run, pose_run, tmp_path):
     """The other tasks, two of them by a chain of networks; two that read poses off shapes."""
